@@ -1,0 +1,78 @@
+"""The policy decorator: a frozen base policy plus a bounded residual that is switched on gradually (facts.md 1.1).
+
+    executed action   a = a_base(o) + alpha * a_res(o),   a_res in [-1, 1]^d
+    gate at step t    per environment and decision, with probability 1 - min(t / H, 1): a_res := 0
+    critic sees       the sum a (by default); the actor sees the observation (by default)
+
+Everything here is a pure function of tensors or arrays, so that each line can be tested alone.
+"""
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from .errors import PdkitError, unknown
+
+CRITIC_INPUTS = ("sum", "concat", "residual")  # appendix E.2
+ACTOR_INPUTS = ("obs", "obs+base")  # appendix E.1
+
+
+@dataclass(frozen=True)
+class DecoratorConfig:
+    """What bounds the residual and what the networks see."""
+
+    alpha: float = 0.1  # bound of the residual per action dimension; the paper's range over tasks is 0.03 to 0.8
+    H: int = 30_000  # primitive steps over which the gate opens; 0 means always open
+    critic_input: str = "sum"  # sum: a_base + alpha * a_res; concat: both; residual: alpha * a_res alone
+    actor_input: str = "obs"  # obs: the current observation; obs+base: with the base action
+
+    def __post_init__(self):
+        if not 0 < self.alpha <= 1:
+            raise PdkitError(f"alpha bounds the residual and must be in (0, 1], not {self.alpha}.")
+        if self.H < 0:
+            raise PdkitError(f"H counts environment steps and must be 0 or more, not {self.H}.")
+        if self.critic_input not in CRITIC_INPUTS:
+            raise unknown("critic_input", self.critic_input, CRITIC_INPUTS)
+        if self.actor_input not in ACTOR_INPUTS:
+            raise unknown("actor_input", self.actor_input, ACTOR_INPUTS)
+
+    def critic_dim(self, obs_dim: int, act_dim: int) -> int:
+        return obs_dim + act_dim * (2 if self.critic_input == "concat" else 1)
+
+    def actor_dim(self, obs_dim: int, act_dim: int) -> int:
+        return obs_dim + act_dim * (1 if self.actor_input == "obs+base" else 0)
+
+
+def compose(config: DecoratorConfig, base, residual):
+    """The executed action, before the environment clips it. The critic sees this unclipped sum too."""
+    return base + config.alpha * residual
+
+
+def critic_features(config: DecoratorConfig, obs: torch.Tensor, base: torch.Tensor, residual: torch.Tensor) -> torch.Tensor:
+    """What the critic sees, (B, critic_dim)."""
+    if config.critic_input == "sum":
+        return torch.cat([obs, compose(config, base, residual)], dim=-1)
+    if config.critic_input == "concat":
+        return torch.cat([obs, base, config.alpha * residual], dim=-1)
+    return torch.cat([obs, config.alpha * residual], dim=-1)
+
+
+def actor_features(config: DecoratorConfig, obs: torch.Tensor, base: torch.Tensor) -> torch.Tensor:
+    """What the residual policy sees, (B, actor_dim)."""
+    return obs if config.actor_input == "obs" else torch.cat([obs, base], dim=-1)
+
+
+def gate_probability(config: DecoratorConfig, step: int) -> float:
+    """Probability that the residual is on at environment step `step`: min(step / H, 1)."""
+    return 1.0 if config.H == 0 else min(step / config.H, 1.0)
+
+
+def gate(config: DecoratorConfig, residual: np.ndarray, step: int, rng: np.random.Generator) -> np.ndarray:
+    """Residuals (N, act_dim) with each environment's row set to zero independently with probability 1 - gate_probability.
+
+    The zero is what is executed and what is stored, so the critic sees the base action it led to.
+    """
+    on = rng.random(len(residual)) < gate_probability(config, step)
+    return residual * on[:, None].astype(residual.dtype)

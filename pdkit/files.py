@@ -1,0 +1,103 @@
+"""Writing files so that a crash, a full disk or Ctrl-C never leaves half of one, and reading them with clear errors."""
+from __future__ import annotations
+
+import errno
+import hashlib
+import json
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from .errors import PdkitError
+
+ROOT = Path(__file__).resolve().parent.parent
+DATA = ROOT / "data"
+
+
+def _told(error: OSError, target: Path) -> PdkitError:
+    if error.errno == errno.ENOSPC:
+        return PdkitError(f"The disk is full while writing {target}; free some space and run the command again.")
+    if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
+        return PdkitError(f"No permission to write {target}; choose another folder (for runs: --out or PDKIT_RUNS).")
+    return PdkitError(f"Cannot write {target}: {error.strerror or error}.")
+
+
+@contextmanager
+def atomic_file(path: str | Path) -> Iterator[Path]:
+    """Yield a temporary path beside `path`; on success rename it onto `path`, on failure remove it.
+
+    Raises PdkitError when the folder cannot be written or the disk is full.
+    """
+    path = Path(path)
+    temporary = path.with_name(f"{path.name}.tmp-{os.getpid()}{path.suffix}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        yield temporary
+        os.replace(temporary, path)
+    except OSError as error:
+        raise _told(error, path) from error
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def atomic_folder(path: str | Path) -> Iterator[Path]:
+    """The same for a folder: a reader sees the old one or the new one, never a mixture."""
+    path = Path(path)
+    temporary = path.with_name(f"{path.name}.tmp-{os.getpid()}")
+    old = path.with_name(f"{path.name}.tmp-old-{os.getpid()}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        shutil.rmtree(temporary, ignore_errors=True)
+        temporary.mkdir()
+        yield temporary
+        if path.exists():
+            os.replace(path, old)
+        os.replace(temporary, path)
+    except OSError as error:
+        if old.exists() and not path.exists():
+            os.replace(old, path)
+        raise _told(error, path) from error
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+        shutil.rmtree(old, ignore_errors=True)
+
+
+def write_json(path: str | Path, value: Any) -> None:
+    """Write `value` as readable JSON, atomically. NaN is written as NaN, which Python reads back."""
+    with atomic_file(path) as temporary:
+        temporary.write_text(json.dumps(value, indent=1, default=_plain) + "\n")
+
+
+def _plain(value: Any) -> Any:
+    """numpy numbers, arrays and paths as JSON types."""
+    if hasattr(value, "tolist"):
+        return value.tolist()
+    if isinstance(value, Path):
+        return str(value)
+    raise TypeError(f"{type(value).__name__} is not a JSON type")
+
+
+def read_json(path: str | Path) -> Any:
+    """Read JSON. Raises PdkitError when the file is missing or is not JSON."""
+    path = Path(path)
+    try:
+        return json.loads(path.read_text())
+    except FileNotFoundError:
+        raise PdkitError(f"{path} does not exist.") from None
+    except (json.JSONDecodeError, UnicodeDecodeError):
+        raise PdkitError(f"{path} is not a readable JSON file; it may be truncated or foreign.") from None
+    except OSError as error:
+        raise PdkitError(f"Cannot read {path}: {error.strerror}.") from None
+
+
+def sha256(path: str | Path) -> str:
+    """Checksum of a file, hexadecimal."""
+    digest = hashlib.sha256()
+    with open(path, "rb") as handle:
+        for block in iter(lambda: handle.read(1 << 20), b""):
+            digest.update(block)
+    return digest.hexdigest()

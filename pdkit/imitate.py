@@ -1,0 +1,107 @@
+"""Offline training of base policies from demonstrations, with checkpoint selection (appendix B.1.3: the checkpoint with the
+best success over 50-episode evaluations)."""
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from .demos.format import Demos
+from .errors import PdkitError
+from .evaluate import evaluate
+from .policies import POLICIES, Policy
+from .seeds import selection_seeds
+from .tasks import get_task
+from .torch_setup import autocast
+
+
+@dataclass(frozen=True)
+class ImitateConfig:
+    """How a base policy is trained."""
+
+    iterations: int = 1500  # gradient steps
+    batch: int = 256  # windows per step
+    lr: float = 1e-3  # AdamW, constant
+    weight_decay: float = 2e-4  # on the GPT's linear weights
+    pad_start: bool = True  # windows before step 0 repeat the first observation, as acting does; the paper's code skips them
+    eval_every: int = 500  # gradient steps between checkpoints
+    eval_episodes: int = 50  # per checkpoint, on selection seeds; 0 keeps the last
+    seed: int = 0
+    bf16: bool = True  # autocast to bfloat16 where the CPU or GPU has it
+
+
+class Windows:
+    """All training windows of a demonstration set: (window, obs_dim) observations with the action taken at each position."""
+
+    def __init__(self, demos: Demos, window: int, pad_start: bool):
+        observations, actions, index, offset = [], [], [], 0
+        for episode in demos.episodes():
+            o, a = episode["observations"][:-1], episode["actions"]
+            pad = window - 1 if pad_start else 0
+            # Before the first step the first observation repeats; the action there is the first one's.
+            o, a = (np.concatenate([np.repeat(x[:1], pad, axis=0), x]) for x in (o, a))
+            index.extend(offset + np.arange(max(0, len(a) - window + 1)))
+            offset += len(a)
+            observations.append(o)
+            actions.append(a)
+        if not index:
+            raise PdkitError(f"Every demonstration is shorter than the window of {window}; use a smaller window or pad_start=True.")
+        self.observations = torch.from_numpy(np.concatenate(observations))
+        self.actions = torch.from_numpy(np.concatenate(actions))
+        self.index = torch.tensor(np.array(index))
+        self.span = torch.arange(window)
+
+    def sample(self, batch: int, generator: torch.Generator) -> tuple[torch.Tensor, torch.Tensor]:
+        """(B, window, obs_dim) and (B, window, act_dim)."""
+        start = self.index[torch.randint(len(self.index), (batch,), generator=generator)]
+        rows = start[:, None] + self.span
+        return self.observations[rows], self.actions[rows]
+
+
+def imitate(kind: str, demos: Demos, config: ImitateConfig | None = None, policy_config: dict | None = None, *, device: str = "cpu",
+            progress: Callable[[dict], None] | None = None) -> tuple[Policy, list[dict]]:
+    """Train a policy of `kind` on `demos`.
+
+    Returns the selected policy in evaluation mode, and one row per checkpoint: iteration, loss terms, seconds and, when
+    evaluated, success_once and success_at_end on the selection seeds.
+    """
+    config = config or ImitateConfig()
+    spec = get_task(demos.task)
+    torch.manual_seed(config.seed)
+    generator = torch.Generator().manual_seed(config.seed)
+    policy = POLICIES[kind]({"obs_dim": spec.obs_dim, "act_dim": spec.act_dim, **(policy_config or {})})
+    policy.fit_statistics(demos.observations, demos.actions, config.seed)
+    policy.to(device).train()
+    windows = Windows(demos, policy.window, config.pad_start)
+    optimizer = torch.optim.AdamW(policy.parameter_groups(config.weight_decay), lr=config.lr, fused=True)
+    history, best, best_state, started = [], -1.0, None, time.monotonic()
+    for iteration in range(1, config.iterations + 1):
+        observations, actions = (x.to(device) for x in windows.sample(config.batch, generator))
+        with autocast(device, config.bf16):
+            terms = policy.loss(observations, actions)
+        optimizer.zero_grad(set_to_none=True)
+        terms["loss"].backward()
+        optimizer.step()
+        if iteration % config.eval_every and iteration < config.iterations:
+            continue
+        row = {"iteration": iteration, "seconds": time.monotonic() - started, **{k: float(v) for k, v in terms.items()}}
+        if not np.isfinite(row["loss"]):
+            raise PdkitError(f"The imitation loss became {row['loss']} at iteration {iteration}; lower lr (now {config.lr}).")
+        score = float(iteration)  # without evaluations the latest wins
+        if config.eval_episodes:
+            policy.eval()
+            policy.reset(config.seed)
+            table = evaluate(spec, policy.act, selection_seeds(config.eval_episodes), window=policy.window, chunk=policy.chunk)
+            row |= {"success_once": float(table.success_once.mean()), "success_at_end": float(table.success_at_end.mean())}
+            score = row["success_once"]
+            policy.train()
+        if score > best:
+            best, best_state = score, {k: v.clone() for k, v in policy.state_dict().items()}
+        history.append(row)
+        if progress:
+            progress(row)
+    policy.load_state_dict(best_state)
+    return policy.eval(), history

@@ -1,0 +1,285 @@
+"""The one loop of every online method: act, learn while the simulators run, store, evaluate, checkpoint.
+
+Steps are primitive environment steps. The loop is deterministic on a CPU: the learner works on what was stored before the
+step now in flight, so neither the number of workers nor a restart from a checkpoint changes the curve.
+"""
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+
+from .decorated import Decorated
+from .decorator import DecoratorConfig, compose, gate, gate_probability
+from .demos.format import Demos
+from .errors import PdkitError, unknown
+from .evaluate import evaluate
+from .policies import Policy
+from .rl.replay import NStep, Replay
+from .rl.sac import SAC, SACConfig
+from .runs import Run
+from .seeds import selection_seeds, training_seed
+from .tasks import get_task
+from .tasks.spec import TaskSpec
+from .tasks.vector import Episode, VectorEnv
+
+WARMUPS = ("base", "uniform")
+ON_SUCCESS = ("terminate", "continue")
+BOOTSTRAPS = ("truncated", "never", "always")
+
+
+@dataclass(frozen=True)
+class OnlineConfig:
+    """The loop and everything in it; the profiles (profiles.py) give values for each task."""
+
+    task: str = "Door"
+    seed: int = 0
+    total_steps: int = 50_000  # primitive environment steps
+    num_envs: int = 8
+    env_workers: int = 1  # processes that step environments while this one learns; results do not depend on it
+    warmup_steps: int = 4_000  # steps stored before learning starts
+    warmup: str = "base"  # actions until then: the base policy's, or base plus a gated uniform residual (the paper's code)
+    utd: float = 0.5  # gradient updates per environment step after the warm-up
+    batch: int = 256
+    demo_fraction: float = 0.25  # of each batch, drawn from the demonstrations
+    n_step: int = 3
+    gamma: float = 0.97
+    reward_shift: float = -1.0  # added to the sparse 0/1 reward of every decision
+    on_success: str = "terminate"  # training episodes end when solved, or go on to the time limit
+    bootstrap: str = "truncated"  # value of s' at an episode's end: only at time limits, never, or always
+    normalize_obs: bool = True  # networks see observations through the base policy's normaliser (the paper's code: raw)
+    lr_decay_from: float = 1.0  # fraction of the run after which the actor's learning rate falls linearly to a tenth
+    eval_every: int = 10_000
+    eval_episodes: int = 50  # on selection seeds
+    log_every: int = 1_000
+    checkpoint_every: int = 10_000
+    device: str = "cpu"
+    decorator: DecoratorConfig = field(default_factory=DecoratorConfig)
+    sac: SACConfig = field(default_factory=SACConfig)
+
+    def __post_init__(self):
+        for name, known in (("warmup", WARMUPS), ("on_success", ON_SUCCESS), ("bootstrap", BOOTSTRAPS)):
+            if getattr(self, name) not in known:
+                raise unknown(name, getattr(self, name), known)
+        if not 0 <= self.demo_fraction < 1 or not 0 < self.gamma <= 1 or self.n_step < 1 or self.utd < 0 or self.batch < 2:
+            raise PdkitError("The loop needs demo_fraction in [0, 1), gamma in (0, 1], n_step >= 1, utd >= 0 and batch >= 2.")
+        if self.total_steps <= self.warmup_steps:
+            raise PdkitError(f"total_steps ({self.total_steps}) must exceed warmup_steps ({self.warmup_steps}), or nothing is learned.")
+
+
+def stops(config: OnlineConfig, terminated: bool, truncated: bool) -> bool:
+    """Whether the value of s' is left out of the target at this transition."""
+    return {"truncated": terminated, "never": terminated or truncated, "always": False}[config.bootstrap]
+
+
+def demo_rows(demos: Demos, base: Policy, config: OnlineConfig) -> list[np.ndarray]:
+    """Demonstrations as replay rows: the residual stored is the one that makes the executed action the demonstrated one.
+
+    An episode ends as training episodes do: at its first success with on_success="terminate", else at its own end, as a
+    time limit (the value of its last state counts).
+    """
+    steps, rows = NStep(1, config.n_step, config.gamma), []
+    for episode in demos.episodes():
+        observations, actions, success = episode["observations"], episode["actions"], episode["success"]
+        length = len(actions)
+        if config.on_success == "terminate" and success.any():
+            length = int(np.argmax(success)) + 1
+        padded = np.concatenate([np.repeat(observations[:1], base.window - 1, axis=0), observations])
+        windows = np.lib.stride_tricks.sliding_window_view(padded, base.window, axis=0).transpose(0, 2, 1)[: length + 1]
+        bases = base.act(windows)[:, 0]
+        residuals = (actions[:length] - bases[:length]) / config.decorator.alpha
+        for t in range(length):
+            last = t == length - 1
+            terminated = last and config.on_success == "terminate" and bool(success[t])
+            rows += steps.push(0, observations[t], residuals[t], bases[t], float(success[t]) + config.reward_shift, observations[t + 1],
+                               bases[t + 1], stops(config, terminated, last and not terminated), last)
+    return rows
+
+
+class Trainer:
+    """State of one online run. `train()` runs it to the end; `save` and `load` are its checkpoint."""
+
+    def __init__(self, config: OnlineConfig, base: Policy, demos: Demos | None = None):
+        self.config, self.base = config, base.eval()
+        self.spec: TaskSpec = get_task(config.task)
+        if base.chunk != 1:
+            raise PdkitError("The online loop decorates policies that return one action at a time.")
+        if base.config["obs_dim"] != self.spec.obs_dim or base.config["act_dim"] != self.spec.act_dim:
+            raise PdkitError(f"This base policy is for {base.config['obs_dim']} observations and {base.config['act_dim']} actions; "
+                             f"{self.spec.name} has {self.spec.obs_dim} and {self.spec.act_dim}.")
+        torch.manual_seed(config.seed)
+        self.rng = np.random.default_rng([config.seed, 1])
+        self.generator = torch.Generator().manual_seed(config.seed)
+        normalize = base.normalizer if config.normalize_obs else None
+        dims = (self.spec.obs_dim, self.spec.act_dim)
+        self.agent = SAC(*dims, config.sac, config.decorator, normalize=normalize, device=config.device)
+        self.replay = Replay(config.total_steps, *dims, device=config.device)
+        self.demos = None
+        if demos is not None and config.demo_fraction:
+            rows = demo_rows(demos, base, config)
+            self.demos = Replay(len(rows), *dims, device=config.device)
+            self.demos.add(rows)
+        elif config.demo_fraction:
+            raise PdkitError("demo_fraction is above 0 but no demonstrations were given; pass demos or set demo_fraction=0.")
+        self.nstep = NStep(config.num_envs, config.n_step, config.gamma)
+        self.step, self.train_seconds, self.rows, self.recent = 0, 0.0, [], []
+        self.episode_counts = [0] * config.num_envs
+        self.log: dict[str, torch.Tensor] = {}
+
+    def _next_seed(self, lane: int) -> int:
+        self.episode_counts[lane] += 1
+        return training_seed(self.config.seed, lane, self.episode_counts[lane])
+
+    @property
+    def policy(self) -> Decorated:
+        """The decorated policy as it stands (the averaged actor)."""
+        return Decorated(self.base, self.agent.average if self.config.sac.average else self.agent.actor, self.config.decorator,
+                         normalize=self.config.normalize_obs)
+
+    def train(self, run: Run | None = None, progress: Callable[[Trainer], None] | None = None) -> Decorated:
+        """Run to `total_steps`, from a checkpoint in `run` if there is one.
+
+        Raises PdkitError when a loss or weight stops being finite; the last checkpoint is then still good.
+        """
+        c = self.config
+        envs = VectorEnv(self.spec, c.num_envs, self._next_seed, window=self.base.window, workers=c.env_workers,
+                         terminate_on_success=c.on_success == "terminate")
+        with envs:
+            windows, base = self._start(envs, run)
+            while self.step < c.total_steps:
+                started = time.monotonic()
+                before = self.step
+                residual = self._explore(windows[:, -1], base)
+                envs.send(compose(c.decorator, base, residual)[:, None])
+                self._learn()
+                result = envs.receive()
+                base_next, base_final = self._base_actions(result)
+                self._store(windows[:, -1], residual, base, result, base_final)
+                windows, base = result.windows, base_next
+                self.step += int(result.steps.sum())
+                self.recent += result.episodes
+                self.train_seconds += time.monotonic() - started
+                self._report(before, envs, windows, base, run, progress)
+        return self.policy
+
+    def _start(self, envs: VectorEnv, run: Run | None):
+        if run is not None and run.has_checkpoint:
+            snapshot = self.load(run)
+            windows = envs.restore(snapshot)
+            return windows, snapshot["base"].astype(np.float32)
+        self.base.reset(self.config.seed)
+        windows = envs.reset()
+        return windows, self.base.act(windows)[:, 0]
+
+    def _explore(self, obs: np.ndarray, base: np.ndarray) -> np.ndarray:
+        """Gated residuals (N, act_dim) to execute and store."""
+        c, shape = self.config, base.shape
+        if self.step < c.warmup_steps:
+            residual = np.zeros(shape, np.float32) if c.warmup == "base" else self.rng.uniform(-1, 1, shape).astype(np.float32)
+        else:
+            noise = torch.from_numpy(self.rng.standard_normal(shape).astype(np.float32)).to(c.device)
+            obs, base = (torch.from_numpy(np.ascontiguousarray(x)).to(c.device) for x in (obs, base))
+            residual = self.agent.act(obs, base, noise).float().cpu().numpy()
+        return gate(c.decorator, residual, self.step, self.rng)
+
+    def _learn(self) -> None:
+        c = self.config
+        due = int((self.step - c.warmup_steps) * c.utd) - self.agent.updates
+        if due > 0 and self.replay.size >= c.batch and c.lr_decay_from < 1:
+            done = (self.step / c.total_steps - c.lr_decay_from) / (1 - c.lr_decay_from)
+            self.agent.set_actor_lr(1 - 0.9 * min(max(done, 0.0), 1.0))
+        for _ in range(max(0, due) if self.replay.size >= c.batch else 0):
+            demos = round(c.batch * c.demo_fraction) if self.demos else 0
+            rows = self.replay.draw(c.batch - demos, self.generator)
+            if demos:
+                rows = torch.cat([rows, self.demos.draw(demos, self.generator)])
+            self.log |= self.agent.update(self.replay.unpack(rows), self.generator)
+
+    def _base_actions(self, result) -> tuple[np.ndarray, np.ndarray]:
+        """Base actions (N, act_dim) to act on next, and those at the true successors: the base policy runs once for each
+        distinct window, so only episodes that just ended cost a second one."""
+        ended = np.flatnonzero(result.done)
+        actions = self.base.act(np.concatenate([result.windows, result.final_windows[ended]]))[:, 0]
+        upcoming, final = actions[: len(result.windows)], actions[: len(result.windows)].copy()
+        final[ended] = actions[len(result.windows):]
+        return upcoming, final
+
+    def _store(self, obs, residual, base, result, base_final) -> None:
+        c = self.config
+        for i in range(c.num_envs):
+            stop = stops(c, bool(result.terminated[i]), bool(result.truncated[i]))
+            self.replay.add(self.nstep.push(i, obs[i], residual[i], base[i], float(result.reward[i]) + c.reward_shift,
+                                            result.final_windows[i, -1], base_final[i], stop, bool(result.done[i])))
+
+    def _report(self, before: int, envs: VectorEnv, windows, base, run: Run | None, progress) -> None:
+        c = self.config
+
+        def crossed(every: int) -> bool:
+            return bool(every) and (self.step // every > before // every or self.step >= c.total_steps)
+
+        if crossed(c.log_every) or crossed(c.eval_every):
+            row = self._row()
+            if crossed(c.eval_every) and c.eval_episodes:
+                row |= self._evaluate()
+            self.rows.append(row)
+            if progress:
+                progress(self)
+        if run is not None and crossed(c.checkpoint_every):
+            self.save(run, envs.snapshot() | {"base": base})
+
+    def _row(self) -> dict:
+        values = {name: float(value) for name, value in self.log.items()}
+        if not all(np.isfinite(v) for v in values.values()):
+            raise PdkitError(f"Training stopped at step {self.step}: {', '.join(k for k, v in values.items() if not np.isfinite(v))} is no "
+                             "longer a number; the last checkpoint is good: lower the learning rates, or set bf16=False, and resume.")
+        episodes, self.recent = self.recent, []
+        if episodes:
+            values |= {"train_success": float(np.mean([e.success_once for e in episodes])), "train_episodes": len(episodes),
+                       "train_length": float(np.mean([e.length for e in episodes]))}
+        return {"step": self.step, "updates": self.agent.updates, "seconds": self.train_seconds,
+                "gate": gate_probability(self.config.decorator, self.step), **values}
+
+    def _evaluate(self) -> dict:
+        # Evaluation must not disturb the random numbers of training: a base policy may draw from torch's global generator.
+        state = torch.get_rng_state()
+        started = time.monotonic()
+        self.policy.reset(self.config.seed)
+        table = evaluate(self.spec, self.policy.act, selection_seeds(self.config.eval_episodes), window=self.base.window, num_envs=25)
+        torch.set_rng_state(state)
+        return {"success_once": float(table.success_once.mean()), "success_at_end": float(table.success_at_end.mean()),
+                "eval_seconds": time.monotonic() - started}
+
+    def save(self, run: Run, snapshot: dict[str, np.ndarray]) -> None:
+        """Write a checkpoint: everything the rest of the run depends on, environments included (as seeds and actions)."""
+        arrays = {f"envs.{k}": v for k, v in snapshot.items()} | {f"nstep.{k}": v for k, v in self.nstep.state().items()}
+        arrays |= {"replay": self.replay.rows[: self.replay.size].cpu().numpy(), "episode_counts": np.array(self.episode_counts),
+                   "generator": self.generator.get_state().numpy(), "torch_rng": torch.get_rng_state().numpy()}
+        arrays |= {f"agent.{k}": v.numpy() for k, v in self.agent.state().items()}
+        values = {"step": self.step, "train_seconds": self.train_seconds, "position": self.replay.position, "rows": self.rows,
+                  "rng": self.rng.bit_generator.state, "recent": [vars(e) for e in self.recent],
+                  "log": {k: float(v) for k, v in self.log.items()}}
+        run.save_checkpoint(arrays, values)
+
+    def load(self, run: Run) -> dict[str, np.ndarray]:
+        """Restore a checkpoint; what the environments need."""
+        arrays, values = run.load_checkpoint()
+
+        def group(name: str) -> dict[str, np.ndarray]:
+            return {k.removeprefix(f"{name}."): v for k, v in arrays.items() if k.startswith(f"{name}.")}
+
+        self.agent.load({k: torch.from_numpy(v) for k, v in group("agent").items()})
+        replay = torch.from_numpy(arrays["replay"])
+        self.replay.rows[: len(replay)] = replay
+        self.replay.size, self.replay.position = len(replay), values["position"]
+        self.nstep.load(group("nstep"), self.spec.obs_dim, self.spec.act_dim)
+        self.generator.set_state(torch.from_numpy(arrays["generator"]))
+        torch.set_rng_state(torch.from_numpy(arrays["torch_rng"]))
+        self.rng.bit_generator.state = values["rng"]
+        self.episode_counts = arrays["episode_counts"].tolist()
+        self.step, self.train_seconds, self.rows = values["step"], values["train_seconds"], values["rows"]
+        self.recent = [Episode(**e) for e in values["recent"]]
+        self.log = {k: torch.tensor(v) for k, v in values["log"].items()}
+        return group("envs")

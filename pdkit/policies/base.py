@@ -1,0 +1,129 @@
+"""The policy protocol, observation normalisation, and files on disk (safetensors + json, never pickle)."""
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import nn
+
+from ..errors import PdkitError, unknown
+from ..files import atomic_folder, read_json, sha256, write_json
+
+FORMAT = "pdkit-policy-1"
+
+
+class Normalizer(nn.Module):
+    """Observations to zero mean and unit variance, per dimension; part of every checkpoint."""
+
+    def __init__(self, dim: int):
+        super().__init__()
+        self.register_buffer("mean", torch.zeros(dim))
+        self.register_buffer("std", torch.ones(dim))
+
+    @torch.no_grad()
+    def fit(self, observations: np.ndarray) -> None:
+        """From observations (N, dim). A dimension that never varies is passed through unscaled."""
+        std = observations.std(axis=0)
+        self.mean.copy_(torch.from_numpy(observations.mean(axis=0)))
+        self.std.copy_(torch.from_numpy(np.where(std < 1e-4, 1.0, std)))
+
+    def forward(self, observations: torch.Tensor) -> torch.Tensor:
+        return (observations - self.mean) / self.std
+
+
+class Policy(nn.Module):
+    """A policy over a window of observations: (N, window, obs_dim) -> an action chunk (N, chunk, act_dim) in [-1, 1].
+
+    The window is kept by the vectorised environment, so a policy holds no state per episode; `reset(seed)` restarts
+    its own random numbers (dropout, sampling). The one policy with memory, BC-RNN, reads the window afresh.
+    """
+
+    kind = ""  # its name in POLICIES
+    window = 1  # observations it looks at
+    chunk = 1  # primitive actions it returns
+
+    def __init__(self, config: dict[str, Any]):
+        super().__init__()
+        self.config = config  # everything its constructor needs, JSON types only
+
+    def reset(self, seed: int) -> None:
+        """Restart the random numbers that acting draws (dropout, sampling noise): torch's global generator."""
+        torch.manual_seed(seed)
+
+    def fit_statistics(self, observations: np.ndarray, actions: np.ndarray, seed: int = 0) -> None:
+        """What is computed from the demonstrations rather than learned: normaliser, k-means bins."""
+        raise NotImplementedError
+
+    def parameter_groups(self, weight_decay: float) -> list[dict[str, Any]]:
+        """Parameter groups for AdamW."""
+        raise NotImplementedError
+
+    def loss(self, windows: torch.Tensor, actions: torch.Tensor) -> dict[str, torch.Tensor]:
+        """Imitation loss for windows (B, window, obs_dim) and the actions taken at each position (B, window, act_dim);
+        a dict of scalars of which `loss` is minimised."""
+        raise NotImplementedError
+
+    def forward(self, windows: torch.Tensor) -> torch.Tensor:
+        """Actions (N, chunk, act_dim) for windows (N, window, obs_dim)."""
+        raise NotImplementedError
+
+    @torch.inference_mode()
+    def act(self, windows: np.ndarray) -> np.ndarray:
+        """The same with numpy arrays and the actions clipped to [-1, 1]: what every loop calls."""
+        device = next(self.parameters()).device
+        actions = self(torch.from_numpy(np.ascontiguousarray(windows, np.float32)).to(device))
+        return actions.clamp(-1, 1).float().cpu().numpy()
+
+
+def save_policy(policy: Policy, folder: str | Path, info: dict[str, Any] | None = None) -> None:
+    """Write `policy` to `folder`: weights.safetensors (float32 or bfloat16, as they are), and policy.json with its
+    kind, configuration, the weights' checksum and `info` (how it was trained, how it scored)."""
+    from safetensors.torch import save_file
+
+    folder = Path(folder)
+    with atomic_folder(folder) as temporary:
+        save_file({name: tensor.detach().cpu().contiguous() for name, tensor in policy.state_dict().items()},
+                  temporary / "weights.safetensors")
+        card = {"format": FORMAT, "kind": policy.kind, "config": policy.config,
+                "weights_sha256": sha256(temporary / "weights.safetensors"), "info": info or {}}
+        write_json(temporary / "policy.json", card)
+
+
+def read_card(folder: str | Path) -> dict[str, Any]:
+    """policy.json of a saved policy. Raises PdkitError when it is missing or not one of ours."""
+    folder = Path(folder)
+    card = read_json(folder / "policy.json")
+    if not isinstance(card, dict) or card.get("format") != FORMAT:
+        raise PdkitError(f"{folder}/policy.json is not a {FORMAT} file; it was written by something else or another version.")
+    return card
+
+
+def load_policy(folder: str | Path, device: str | torch.device = "cpu") -> Policy:
+    """The policy saved in `folder`, ready to act.
+
+    Raises PdkitError when a file is missing, truncated, altered (checksum) or does not fit its configuration.
+    """
+    from safetensors import SafetensorError
+    from safetensors.torch import load_file
+
+    from . import POLICIES
+
+    folder = Path(folder)
+    card = read_card(folder)
+    if card["kind"] not in POLICIES:
+        raise unknown("policy", card["kind"], POLICIES)
+    weights = folder / "weights.safetensors"
+    if not weights.exists():
+        raise PdkitError(f"{weights} is missing; copy the whole checkpoint folder or train it again with `pdkit train`.")
+    if sha256(weights) != card["weights_sha256"]:
+        raise PdkitError(f"{weights} was truncated or altered (its checksum differs from policy.json); restore it or train it again.")
+    try:
+        policy = POLICIES[card["kind"]](card["config"])
+        state = load_file(weights)
+        policy.load_state_dict({name: tensor.float() for name, tensor in state.items()})
+    except (SafetensorError, RuntimeError, TypeError, KeyError) as error:
+        raise PdkitError(f"{folder} does not hold the {card['kind']} policy that its policy.json describes "
+                         f"({type(error).__name__}); train it again.") from error
+    return policy.to(device).eval()

@@ -1,0 +1,39 @@
+"""The plain behaviour-cloning MLP: one observation to one action, mean squared error."""
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import nn
+
+from .base import Normalizer, Policy
+
+
+class MLP(Policy):
+    """Config: obs_dim, act_dim, hidden, layers."""
+
+    kind = "mlp"
+    defaults: dict[str, Any] = dict(window=1, hidden=256, layers=3)
+
+    def __init__(self, config: dict[str, Any]):
+        super().__init__(self.defaults | config)
+        c = self.config
+        self.normalizer = Normalizer(c["obs_dim"])
+        sizes = [c["obs_dim"], *[c["hidden"]] * c["layers"]]
+        layers = [m for a, b in zip(sizes[:-1], sizes[1:], strict=True) for m in (nn.Linear(a, b), nn.ReLU())]
+        self.net = nn.Sequential(*layers, nn.Linear(sizes[-1], c["act_dim"]))
+
+    def fit_statistics(self, observations: np.ndarray, actions: np.ndarray, seed: int = 0) -> None:
+        """Normaliser from observations (N, obs_dim)."""
+        self.normalizer.fit(observations)
+
+    def loss(self, windows: torch.Tensor, actions: torch.Tensor) -> dict[str, torch.Tensor]:
+        return {"loss": F.mse_loss(self.net(self.normalizer(windows)), actions)}
+
+    def forward(self, windows: torch.Tensor) -> torch.Tensor:
+        return self.net(self.normalizer(windows[:, -1:]))
+
+    def parameter_groups(self, weight_decay: float) -> list[dict[str, Any]]:
+        return [{"params": list(self.net.parameters()), "weight_decay": weight_decay}]

@@ -1,0 +1,1 @@
+"""Reinforcement learning: networks, replay and SAC."""

@@ -1,0 +1,172 @@
+"""Soft actor-critic on residual actions (Haarnoja et al., 2018; facts.md 1.1 to 1.3).
+
+    target   y = reward + discount * (min_i Qbar_i(s', a') - temperature * log pi(a_res' | s')),  a' = compose(base', a_res')
+    critic   sum_i mean (Q_i(s, a) - y)^2
+    actor    mean (temperature * log pi(a_res | s) - min_i Q_i(s, compose(base, a_res)))
+    temperature   -log_temperature * mean (log pi + target_entropy)
+
+log pi is that of the unscaled residual: alpha does not enter the entropy. Plain SAC is the case base = 0, alpha = 1.
+"""
+from __future__ import annotations
+
+import copy
+import math
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+
+from ..decorator import DecoratorConfig, actor_features, critic_features
+from ..errors import PdkitError
+from ..torch_setup import autocast
+from .networks import Actor, Critics
+
+
+@dataclass(frozen=True)
+class SACConfig:
+    """Optimisation and networks; the defaults are the lesson profile's, the paper's are in profiles.py."""
+
+    actor_lr: float = 3e-4
+    critic_lr: float = 3e-4  # the temperature uses it too
+    tau: float = 0.01  # step of the target critics towards the critics
+    hidden: int = 256
+    layers: int = 3
+    num_critics: int = 2
+    critic_layer_norm: bool = True  # DAWN, RLPD: keeps values bounded off the data
+    actor_layer_norm: bool = False
+    log_std_range: tuple[float, float] = (-5.0, 2.0)  # the paper's code: (-20, 2)
+    init_temperature: float = 0.01  # the paper's: 1.0
+    autotune: bool = True  # learn the temperature
+    target_entropy_scale: float = 1.0  # target entropy = -scale * act_dim
+    entropy_backup: bool = True  # the entropy term inside the target
+    grad_clip: float = 50.0  # global norm, separately for each critic and the actor
+    actor_every: int = 1  # critic updates per actor update
+    average: float = 0.999  # decay of the averaged actor that evaluation uses; 0 evaluates the last weights
+    bf16: bool = True  # autocast to bfloat16 where the hardware has it
+
+    def __post_init__(self):
+        if self.num_critics < 1 or self.actor_lr <= 0 or self.critic_lr <= 0 or not 0 < self.tau <= 1 or not 0 <= self.average < 1:
+            raise PdkitError("SAC needs num_critics >= 1, positive learning rates, tau in (0, 1] and average in [0, 1).")
+
+
+class SAC:
+    """The learner. `normalize` maps observations (B, obs_dim) before any network sees them (identity by default)."""
+
+    def __init__(self, obs_dim: int, act_dim: int, config: SACConfig, decorator: DecoratorConfig, *, normalize=None, device: str = "cpu"):
+        self.config, self.decorator, self.device = config, decorator, device
+        self.normalize = normalize or (lambda obs: obs)
+        c = config
+        self.actor = Actor(decorator.actor_dim(obs_dim, act_dim), act_dim, c.hidden, c.layers, c.actor_layer_norm, c.log_std_range).to(device)
+        self.critics = Critics(decorator.critic_dim(obs_dim, act_dim), c.hidden, c.layers, c.num_critics, c.critic_layer_norm).to(device)
+        self.targets = copy.deepcopy(self.critics).requires_grad_(False)
+        self.average = copy.deepcopy(self.actor).requires_grad_(False)
+        self.log_temperature = torch.full((), math.log(c.init_temperature), device=device, requires_grad=c.autotune)
+        self.target_entropy = -c.target_entropy_scale * act_dim
+        self.actor_optimizer = torch.optim.Adam(self.actor.parameters(), lr=c.actor_lr, fused=True)
+        self.critic_optimizer = torch.optim.Adam(self.critics.parameters(), lr=c.critic_lr, fused=True)
+        self.temperature_optimizer = torch.optim.Adam([self.log_temperature], lr=c.critic_lr, fused=True) if c.autotune else None
+        self.updates = 0
+
+    @torch.no_grad()
+    def act(self, obs: torch.Tensor, base: torch.Tensor, noise: torch.Tensor | None = None) -> torch.Tensor:
+        """Residuals (B, act_dim) in [-1, 1]: sampled with the given normal noise, or, without, the deterministic ones of the
+        averaged actor (of the last one when average is 0)."""
+        with autocast(self.device, self.config.bf16):
+            x = actor_features(self.decorator, self.normalize(obs), base)
+            if noise is not None:
+                return self.actor.sample(x, noise)[0]
+            return (self.average if self.config.average else self.actor).mean_action(x)
+
+    def update(self, batch: dict[str, torch.Tensor], generator: torch.Generator) -> dict[str, torch.Tensor]:
+        """One gradient step on each part; scalar tensors for the log (no synchronisation with the device)."""
+        obs, next_obs = self.normalize(batch["obs"]), self.normalize(batch["next_obs"])
+        noise = torch.randn((2, *batch["base"].shape), generator=generator).to(self.device)
+        temperature = self.log_temperature.detach().exp()
+        log = self._update_critics(batch, obs, next_obs, noise[0], temperature)
+        if self.updates % self.config.actor_every == 0:
+            log |= self._update_actor(batch, obs, noise[1], temperature)
+        with torch.no_grad():
+            torch._foreach_lerp_(list(self.targets.parameters()), list(self.critics.parameters()), self.config.tau)
+        self.updates += 1
+        return log
+
+    def td_target(self, batch, next_obs, noise, temperature) -> torch.Tensor:
+        """y, (B,)."""
+        with torch.no_grad(), autocast(self.device, self.config.bf16):
+            residual, log_pi = self.actor.sample(actor_features(self.decorator, next_obs, batch["next_base"]), noise)
+            value = self.targets(critic_features(self.decorator, next_obs, batch["next_base"], residual)).min(dim=0).values
+            if self.config.entropy_backup:
+                value = value - temperature * log_pi
+            return batch["reward"] + batch["discount"] * value
+
+    def _update_critics(self, batch, obs, next_obs, noise, temperature) -> dict[str, torch.Tensor]:
+        target = self.td_target(batch, next_obs, noise, temperature)
+        with autocast(self.device, self.config.bf16):
+            values = self.critics(critic_features(self.decorator, obs, batch["base"], batch["residual"]))
+            loss = F.mse_loss(values, target.expand_as(values), reduction="none").mean(dim=1).sum()
+        self.critic_optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        for member in self.critics.members:
+            torch.nn.utils.clip_grad_norm_(member.parameters(), self.config.grad_clip)
+        self.critic_optimizer.step()
+        return {"critic_loss": loss.detach() / self.config.num_critics, "q_mean": values.detach().mean(), "target_mean": target.mean()}
+
+    def _update_actor(self, batch, obs, noise, temperature) -> dict[str, torch.Tensor]:
+        self.critics.requires_grad_(False)  # their weights' gradients would be thrown away
+        with autocast(self.device, self.config.bf16):
+            residual, log_pi = self.actor.sample(actor_features(self.decorator, obs, batch["base"]), noise)
+            value = self.critics(critic_features(self.decorator, obs, batch["base"], residual)).min(dim=0).values
+            loss = (temperature * log_pi - value).mean()
+        self.actor_optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(self.actor.parameters(), self.config.grad_clip)
+        self.actor_optimizer.step()
+        self.critics.requires_grad_(True)
+        with torch.no_grad():
+            if self.config.average:
+                # A plain mean at first (decay 1 - 1/k), so that the near-zero start is forgotten quickly.
+                decay = min(self.config.average, 1 - 1 / (self.updates // self.config.actor_every + 1))
+                torch._foreach_lerp_(list(self.average.parameters()), list(self.actor.parameters()), 1 - decay)
+        entropy = -log_pi.detach().mean()
+        if self.temperature_optimizer:
+            self.temperature_optimizer.zero_grad(set_to_none=True)
+            (self.log_temperature * (entropy - self.target_entropy)).backward()
+            self.temperature_optimizer.step()
+        return {"actor_loss": loss.detach(), "entropy": entropy, "temperature": temperature, "residual_abs": residual.detach().abs().mean()}
+
+    def set_actor_lr(self, factor: float) -> None:
+        """Scale the actor's learning rate (smaller late steps)."""
+        for group in self.actor_optimizer.param_groups:
+            group["lr"] = self.config.actor_lr * factor
+
+    def state(self) -> dict[str, torch.Tensor]:
+        """Everything that training goes on from, as named tensors."""
+        tensors = {"log_temperature": self.log_temperature.detach(), "updates": torch.tensor(self.updates)}
+        for name, module in self._modules().items():
+            tensors |= {f"{name}.{k}": v for k, v in module.state_dict().items()}
+        for name, optimizer in self._optimizers().items():
+            for i, slots in optimizer.state_dict()["state"].items():
+                tensors |= {f"{name}.{i}.{slot}": value for slot, value in slots.items()}
+        return {k: v.detach().cpu().clone().contiguous() for k, v in tensors.items()}
+
+    def load(self, tensors: dict[str, torch.Tensor]) -> None:
+        """Restore what `state` gave."""
+        with torch.no_grad():
+            self.log_temperature.copy_(tensors["log_temperature"])
+        self.updates = int(tensors["updates"])
+        for name, module in self._modules().items():
+            module.load_state_dict({k.removeprefix(f"{name}."): v for k, v in tensors.items() if k.startswith(f"{name}.")})
+        for name, optimizer in self._optimizers().items():
+            state: dict[int, dict[str, torch.Tensor]] = {}
+            for key, value in tensors.items():
+                if key.startswith(f"{name}."):
+                    _, index, slot = key.split(".")
+                    state.setdefault(int(index), {})[slot] = value.clone()
+            optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})
+
+    def _modules(self):
+        return {"actor": self.actor, "critics": self.critics, "targets": self.targets, "average": self.average}
+
+    def _optimizers(self):
+        optimizers = {"adam_actor": self.actor_optimizer, "adam_critic": self.critic_optimizer, "adam_temperature": self.temperature_optimizer}
+        return {name: optimizer for name, optimizer in optimizers.items() if optimizer is not None}

@@ -1,0 +1,116 @@
+"""A run's folder: manifest.json (what was asked, with what, where), metrics.csv, checkpoint/ (safetensors + json)."""
+from __future__ import annotations
+
+import os
+import platform
+import subprocess
+import time
+from datetime import UTC, datetime
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from .errors import PdkitError
+from .files import ROOT, atomic_file, atomic_folder, read_json, sha256, write_json
+
+PACKAGES = ("torch", "numpy", "gymnasium", "gymnasium-robotics", "mujoco", "mani-skill", "sapien")
+
+
+def runs_folder() -> Path:
+    """Where runs go: PDKIT_RUNS, or runs/ in the project."""
+    return Path(os.environ.get("PDKIT_RUNS") or ROOT / "runs")
+
+
+def _git() -> str:
+    try:
+        commit = subprocess.run(["git", "rev-parse", "HEAD"], cwd=ROOT, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
+        dirty = subprocess.run(["git", "status", "--porcelain"], cwd=ROOT, capture_output=True, text=True, check=True, timeout=10).stdout
+        return commit + ("+changes" if dirty.strip() else "")
+    except (OSError, subprocess.SubprocessError):
+        return "unknown"
+
+
+def describe_machine() -> dict[str, Any]:
+    """Versions, processor count, threads and device, for the manifest."""
+    import torch
+
+    versions = {}
+    for name in PACKAGES:
+        try:
+            versions[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            versions[name] = None
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return {"python": platform.python_version(), "system": f"{platform.system()} {platform.machine()}", "cores": cores,
+            "torch_threads": torch.get_num_threads(), "cuda": torch.cuda.is_available(), "versions": versions, "git": _git()}
+
+
+class Run:
+    """One run folder. Opening an existing one with the same parameters resumes it; with other parameters is an error."""
+
+    def __init__(self, folder: str | Path, kind: str, parameters: dict[str, Any]):
+        self.folder = Path(folder)
+        self.manifest_path = self.folder / "manifest.json"
+        if self.manifest_path.exists():
+            self.manifest = read_json(self.manifest_path)
+            self._must_match(kind, parameters)
+        else:
+            self.manifest = {"kind": kind, "parameters": parameters, "started": _now(), "finished": None, "machine": describe_machine()}
+            self._write_manifest()
+
+    def _must_match(self, kind: str, parameters: dict[str, Any]) -> None:
+        import json
+
+        asked = json.loads(json.dumps(parameters))
+        old = self.manifest.get("parameters", {})
+        differing = sorted(k for k in asked.keys() | old.keys() if asked.get(k) != old.get(k))
+        if self.manifest.get("kind") != kind or differing:
+            raise PdkitError(f"{self.folder} holds another run (differing: {', '.join(differing) or 'kind'}); choose another folder or "
+                             "delete this one.")
+
+    def _write_manifest(self) -> None:
+        write_json(self.manifest_path, self.manifest)
+
+    @property
+    def finished(self) -> bool:
+        return bool(self.manifest["finished"])
+
+    def finish(self, **results: Any) -> None:
+        """Mark the run complete and store its results in the manifest."""
+        self.manifest |= {"finished": _now(), "results": results}
+        self._write_manifest()
+
+    def write_metrics(self, rows: list[dict[str, Any]]) -> None:
+        """metrics.csv, one row each."""
+        with atomic_file(self.folder / "metrics.csv") as temporary:
+            pd.DataFrame(rows).to_csv(temporary, index=False)
+
+    @property
+    def has_checkpoint(self) -> bool:
+        return (self.folder / "checkpoint" / "state.json").exists()
+
+    def save_checkpoint(self, arrays: dict[str, np.ndarray], values: dict[str, Any]) -> None:
+        """Replace the checkpoint by named arrays and JSON values; a crash leaves the old one."""
+        from safetensors.numpy import save_file
+
+        with atomic_folder(self.folder / "checkpoint") as temporary:
+            save_file({k: np.ascontiguousarray(v) for k, v in arrays.items()}, temporary / "arrays.safetensors")
+            write_json(temporary / "state.json", values | {"sha256": sha256(temporary / "arrays.safetensors"), "time": time.time()})
+
+    def load_checkpoint(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """The arrays and values saved last. Raises PdkitError when they were truncated or altered."""
+        from safetensors.numpy import load_file
+
+        folder = self.folder / "checkpoint"
+        values = read_json(folder / "state.json")
+        arrays = folder / "arrays.safetensors"
+        if not arrays.exists() or sha256(arrays) != values.get("sha256"):
+            raise PdkitError(f"The checkpoint in {folder} is truncated or altered; delete {self.folder} and start the run again.")
+        return load_file(arrays), values
+
+
+def _now() -> str:
+    return datetime.now(UTC).isoformat(timespec="seconds")

@@ -1,0 +1,24 @@
+"""Which seed is used for what. The ranges never overlap, so nothing is tuned on the episodes that are reported."""
+from __future__ import annotations
+
+import numpy as np
+
+TEST = 1_000_000  # + i: the episodes of every reported comparison
+SELECT = 2_000_000  # + i: choosing a checkpoint
+TRAIN = 10_000_000  # and above: online training
+DEMOS = 0  # + i: scripted experts (below 1,000,000)
+ROLLOUT = 3_000_000  # + i: episodes recorded from agents
+
+
+def test_seeds(num: int) -> list[int]:
+    return list(range(TEST, TEST + num))
+
+
+def selection_seeds(num: int) -> list[int]:
+    return list(range(SELECT, SELECT + num))
+
+
+def training_seed(run_seed: int, lane: int, episode: int) -> int:
+    """The seed of one training episode, well spread over [10^7, 2^31)."""
+    word = np.random.SeedSequence([run_seed, lane, episode]).generate_state(1)[0]
+    return TRAIN + int(word) % (2**31 - TRAIN)

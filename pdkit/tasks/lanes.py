@@ -1,0 +1,217 @@
+"""Lanes: a simulator with its episode, and where they run, in this process or in workers (see vector.py)."""
+from __future__ import annotations
+
+import multiprocessing
+import signal
+from multiprocessing import shared_memory
+
+import numpy as np
+
+from ..errors import PdkitError
+from .spec import TaskSpec
+
+IDLE = -1  # instead of a seed: this lane has nothing more to do
+
+
+class _Lane:
+    """One simulator with its episode bookkeeping; runs in the main process or in a worker."""
+
+    def __init__(self, sim, limit: int, terminate_on_success: bool):
+        self.sim, self.limit, self.terminate_on_success = sim, limit, terminate_on_success
+        self.seed, self.length, self.once = IDLE, 0, False
+
+    def reset(self, seed: int) -> np.ndarray:
+        self.seed, self.length, self.once = int(seed), 0, False
+        return self.sim.reset(self.seed)
+
+    def step(self, chunk: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool, bool]:
+        """(observations after each primitive step taken, success at each, terminated, truncated)."""
+        observations, successes, terminated = [], [], False
+        for action in chunk:
+            observation, success = self.sim.step(action)
+            self.length += 1
+            self.once |= success
+            observations.append(observation)
+            successes.append(success)
+            terminated = self.terminate_on_success and success
+            if terminated or self.length >= self.limit:
+                break
+        # Solving the task on the very last step is a termination, not a time-out.
+        return np.stack(observations), np.array(successes), terminated, self.length >= self.limit and not terminated
+
+
+class _Lanes:
+    """A group of lanes stepped one after the other, writing into shared arrays."""
+
+    def __init__(self, spec: TaskSpec, count: int, limit: int, terminate_on_success: bool):
+        self.lanes = [_Lane(spec.make(), limit, terminate_on_success) for _ in range(count)]
+
+    def step(self, arrays: dict[str, np.ndarray]) -> None:
+        for i, lane in enumerate(self.lanes):
+            arrays["steps"][i] = 0
+            if lane.seed == IDLE:
+                continue
+            observations, successes, terminated, truncated = lane.step(arrays["actions"][i])
+            taken = len(observations)
+            arrays["observations"][i, :taken] = observations
+            arrays["steps"][i], arrays["reward"][i] = taken, successes.sum()
+            arrays["ended"][i] = (terminated, truncated)
+            if terminated or truncated:
+                arrays["episode"][i] = (lane.seed, lane.length, lane.once, successes[-1])
+                self._start(lane, arrays, i, int(arrays["seeds"][i]))
+
+    def reset(self, arrays: dict[str, np.ndarray]) -> None:
+        for i, lane in enumerate(self.lanes):
+            self._start(lane, arrays, i, int(arrays["seeds"][i]))
+
+    def _start(self, lane: _Lane, arrays: dict[str, np.ndarray], i: int, seed: int) -> None:
+        if seed == IDLE:
+            lane.seed = IDLE
+        else:
+            arrays["first"][i] = lane.reset(seed)
+
+    def replay(self, histories: list[tuple[int, np.ndarray]]) -> list[np.ndarray]:
+        """Bring every lane into the episode (seed, primitive actions (T, act_dim)); the observations (T+1, obs_dim)."""
+        out = []
+        for lane, (seed, actions) in zip(self.lanes, histories, strict=True):
+            if seed == IDLE:
+                lane.seed = IDLE
+                out.append(np.zeros((0,), np.float32))
+                continue
+            observations = [lane.reset(seed)]
+            for action in actions:
+                observations.append(lane.step(action[None])[0][0])
+            out.append(np.stack(observations))
+        return out
+
+    def close(self) -> None:
+        for lane in self.lanes:
+            lane.sim.close()
+
+
+class InProcess:
+    """All lanes in this process; the work is done when the result is asked for."""
+
+    def __init__(self, shapes, num_envs: int, arguments):
+        self.arrays = {name: np.zeros(shape, dtype) for name, (shape, dtype) in shapes.items()}
+        spec, limit, terminate = arguments
+        self._lanes = _Lanes(spec, num_envs, limit, terminate)
+        self._pending = ""
+
+    def send(self, command: str) -> None:
+        self._pending = command
+
+    def receive(self) -> None:
+        getattr(self._lanes, self._pending)(self.arrays)
+
+    def call(self, command: str) -> None:
+        self.send(command)
+        self.receive()
+
+    def replay(self, histories):
+        return self._lanes.replay(histories)
+
+    def close(self) -> None:
+        self._lanes.close()
+
+
+class Workers:
+    """Lanes spread over spawned processes; arrays in shared memory, one byte string a command."""
+
+    def __init__(self, shapes, num_envs: int, workers: int, arguments):
+        context = multiprocessing.get_context("spawn")  # fork is unsafe once torch has threads
+        self._memory, self.arrays = _share(shapes)
+        bounds = np.linspace(0, num_envs, workers + 1).astype(int)
+        self._slices = [slice(int(a), int(b)) for a, b in zip(bounds[:-1], bounds[1:], strict=True)]
+        self._pipes, self._processes = [], []
+        names = {name: block.name for name, block in self._memory.items()}
+        for part in self._slices:
+            ours, theirs = context.Pipe()
+            process = context.Process(target=_worker, args=(theirs, names, shapes, part, arguments), daemon=True)
+            process.start()
+            theirs.close()
+            self._pipes.append(ours)
+            self._processes.append(process)
+        for pipe in self._pipes:
+            self._expect(pipe)
+
+    def _expect(self, pipe):
+        try:
+            answer = pipe.recv()
+        except (EOFError, ConnectionResetError):
+            self.close()
+            raise PdkitError("A simulator process died; run `pdkit doctor`, or set env_workers=0 to see its error.") from None
+        if isinstance(answer, BaseException):
+            self.close()
+            raise answer
+        return answer
+
+    def send(self, command: str) -> None:
+        for pipe in self._pipes:
+            pipe.send((command, None))
+
+    def receive(self) -> None:
+        for pipe in self._pipes:
+            self._expect(pipe)
+
+    def call(self, command: str) -> None:
+        self.send(command)
+        self.receive()
+
+    def replay(self, histories):
+        for pipe, part in zip(self._pipes, self._slices, strict=True):
+            pipe.send(("replay", histories[part]))
+        return [item for pipe in self._pipes for item in self._expect(pipe)]
+
+    def close(self) -> None:
+        for pipe in self._pipes:
+            try:
+                pipe.send(("close", None))
+            except OSError:
+                pass
+        for process in self._processes:
+            process.join(timeout=2)
+            if process.is_alive():
+                process.terminate()
+        self.arrays.clear()  # a shared block cannot be closed while arrays look into it
+        for block in self._memory.values():
+            block.close()
+            try:
+                block.unlink()
+            except FileNotFoundError:
+                pass
+        self._memory = {}
+
+
+def _share(shapes) -> tuple[dict[str, shared_memory.SharedMemory], dict[str, np.ndarray]]:
+    blocks, arrays = {}, {}
+    for name, (shape, dtype) in shapes.items():
+        blocks[name] = shared_memory.SharedMemory(create=True, size=max(1, int(np.prod(shape)) * np.dtype(dtype).itemsize))
+        arrays[name] = np.ndarray(shape, dtype, buffer=blocks[name].buf)
+        arrays[name][...] = 0
+    return blocks, arrays
+
+
+def _worker(pipe, names, shapes, part: slice, arguments) -> None:
+    """The process of one worker: build the lanes, then obey commands until told to close or the parent is gone."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
+    blocks = {name: shared_memory.SharedMemory(name=block) for name, block in names.items()}
+    arrays = {name: np.ndarray(*shapes[name], buffer=block.buf)[part] for name, block in blocks.items()}
+    lanes = None
+    try:
+        spec, limit, terminate = arguments
+        lanes = _Lanes(spec, part.stop - part.start, limit, terminate)
+        pipe.send("ready")
+        while True:
+            command, payload = pipe.recv()
+            if command == "close":
+                break
+            pipe.send(lanes.replay(payload) if command == "replay" else getattr(lanes, command)(arrays))
+    except (EOFError, KeyboardInterrupt, BrokenPipeError):
+        pass
+    except Exception as error:
+        pipe.send(PdkitError(f"A simulator process failed: {type(error).__name__}: {error}"))
+    finally:
+        if lanes is not None:
+            lanes.close()
+        arrays.clear()

@@ -1,0 +1,133 @@
+"""Building ManiSkill 3 environments on machines without a Vulkan driver, and asking whether this one can draw.
+
+ManiSkill's `render_backend="none"` already leaves out render systems, visual shapes, cameras and lights. What remains is
+that its loaders construct SAPIEN materials and textures, which need a Vulkan device: here they get inert stand-ins while an
+environment is built. Physics is untouched, so the trajectories are the same with and without a driver.
+"""
+from __future__ import annotations
+
+import logging
+import subprocess
+import sys
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import lru_cache
+from typing import Any
+
+from ..errors import PdkitError
+
+PICTURE = 256  # pixels a side of a rendered frame
+
+# Draws one picture on the first device that can, and prints the device's name. Run in a process of its own, because SAPIEN
+# may crash instead of raising where there is no driver. It avoids importing this package, to be quick.
+_PROBE = """
+import sapien
+for name in ("cuda", "cpu"):
+    try:
+        device = sapien.Device(name)
+        scene = sapien.Scene([sapien.physx.PhysxCpuSystem(), sapien.render.RenderSystem(device)])
+        camera = scene.add_camera("probe", 16, 16, 1.0, 0.1, 10.0)
+        scene.update_render()
+        camera.take_picture()
+        if camera.get_picture("Color").shape == (16, 16, 4):
+            print("DRAWS", name)
+            break
+    except RuntimeError:
+        pass
+"""
+
+
+class _Inert:
+    """Stands in for a SAPIEN material or texture: takes any arguments and attributes, and every `set_...` call."""
+
+    def __init__(self, *args: Any, **kwargs: Any):
+        pass
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("set_"):
+            return lambda *args, **kwargs: None
+        raise AttributeError(name)
+
+
+@contextmanager
+def without_materials() -> Iterator[None]:
+    """Within this block SAPIEN's materials and textures are inert objects that need no Vulkan device."""
+    import sapien.pysapien
+    import sapien.render
+    import sapien.wrapper.urdf_loader
+
+    modules = (sapien.render, sapien.pysapien.render, sapien.wrapper.urdf_loader)
+    names = ("RenderMaterial", "RenderTexture2D")
+    saved = [(module, name, getattr(module, name)) for module in modules for name in names]
+    for module, name, _ in saved:
+        setattr(module, name, _Inert)
+    try:
+        yield
+    finally:
+        for module, name, original in saved:
+            setattr(module, name, original)
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Hide what ManiSkill, SAPIEN and gymnasium warn about at import and build: nothing in it is for a user to act on."""
+    logger = logging.getLogger("mani_skill ")  # the trailing space is ManiSkill's
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            import mani_skill  # noqa: F401  # sets the logger's level when first imported
+        except ImportError as error:
+            raise PdkitError(
+                f"ManiSkill cannot be imported ({error}); run `./pd run` or `pip install -r environment.txt`."
+            ) from error
+        level = logger.level
+        logger.setLevel(logging.ERROR)
+        try:
+            yield
+        finally:
+            logger.setLevel(level)
+
+
+@lru_cache(maxsize=1)
+def render_device() -> str | None:
+    """The device SAPIEN can draw on, "cuda" or "cpu", or None: found by drawing a picture in a subprocess, once a process."""
+    try:
+        done = subprocess.run([sys.executable, "-W", "ignore", "-c", _PROBE], capture_output=True, text=True, timeout=120)
+    except subprocess.TimeoutExpired:
+        return None
+    words = done.stdout.split()
+    return words[-1] if done.returncode == 0 and "DRAWS" in words else None
+
+
+def require_rendering() -> str:
+    """The device to draw on. Raises PdkitError that names the fix where ManiSkill scenes cannot be drawn."""
+    device = render_device()
+    if device is None:
+        raise PdkitError(
+            "ManiSkill scenes cannot be drawn here because SAPIEN finds no working Vulkan driver; train and evaluate without "
+            "pictures, or install one (Debian 12: `apt install -t bookworm-backports mesa-vulkan-drivers`, its stock version "
+            "is too old; Ubuntu: `apt install mesa-vulkan-drivers`; NVIDIA: the driver with its graphics libraries)."
+        )
+    return device
+
+
+def make_env(env_id: str, control_mode: str, render: bool = False, **kwargs: Any) -> Any:
+    """A stock ManiSkill 3 environment, CPU physics, state observations, sparse reward; unwrapped, so without a time limit.
+
+    With `render` it can also draw (slower to build and to step); raises PdkitError where it cannot.
+    """
+    options = dict(obs_mode="state", reward_mode="sparse", control_mode=control_mode, sim_backend="cpu")
+    if render:
+        camera = dict(width=PICTURE, height=PICTURE)
+        options |= dict(
+            render_backend=require_rendering(), render_mode="rgb_array", human_render_camera_configs=camera
+        )
+    with quiet():
+        import gymnasium
+        import mani_skill.envs  # noqa: F401  # registers the tasks
+
+        if render:
+            return gymnasium.make(env_id, **options, **kwargs).unwrapped
+        with without_materials():
+            return gymnasium.make(env_id, render_backend="none", **options, **kwargs).unwrapped

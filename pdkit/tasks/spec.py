@@ -1,0 +1,43 @@
+"""What a task is: one frozen description, and the small simulator interface behind it."""
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+
+class Sim(Protocol):
+    """One simulated world, unbatched numpy, without time limit, reward or autoreset (vector.py adds these).
+
+    `reset(seed)` alone decides everything that follows: the same seed and actions give the same trajectory,
+    whatever was simulated before. Training resume relies on it.
+    """
+
+    def reset(self, seed: int) -> np.ndarray:
+        """Start the episode that `seed` names; the observation, float32 (obs_dim,)."""
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, bool]:
+        """One primitive step with an action (act_dim,), clipped here to [-1, 1]; (observation, success at this step)."""
+
+    def render(self) -> np.ndarray:
+        """The current picture, uint8 (height, width, 3). Raises PdkitError where no render backend works."""
+
+    def close(self) -> None: ...
+
+
+@dataclass(frozen=True)
+class TaskSpec:
+    """A task of the paper (appendix A, Tables 2 and 3) as it runs here."""
+
+    name: str
+    suite: str  # "adroit" (MuJoCo, gymnasium-robotics) or "maniskill" (SAPIEN)
+    obs_dim: int  # state observation
+    act_dim: int
+    max_episode_steps: int  # the paper's limit, in primitive steps
+    control: str  # what an action means
+    success_rule: str  # in words; judged at every step
+    absolute_actions: bool  # actions are targets (pad a chunk by repeating the last), not deltas (pad with zeros)
+    make: Callable[..., Sim]  # make(render=False) -> Sim
+    summary: str = ""  # one sentence for people

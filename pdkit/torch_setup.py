@@ -1,0 +1,51 @@
+"""Device, threads and precision, set in one place and always explicitly."""
+from __future__ import annotations
+
+import contextlib
+import functools
+
+import torch
+
+from .errors import PdkitError
+
+
+def set_threads(num: int) -> None:
+    """Use `num` threads for matrix work in this process. Two processes with two threads each on two cores are ten times slower."""
+    torch.set_num_threads(max(1, num))
+
+
+def pick_device(name: str = "auto") -> str:
+    """`name`, or with "auto" CUDA where there is one. Raises PdkitError when the device asked for is not there."""
+    if name == "auto":
+        return "cuda" if torch.cuda.is_available() else "cpu"
+    if name == "cuda" and not torch.cuda.is_available():
+        raise PdkitError("No CUDA device was found; use device=cpu, or check the driver with `pdkit doctor`.")
+    if name not in ("cpu", "cuda"):
+        raise PdkitError(f"Unknown device {name!r}; choose one of: auto, cpu, cuda.")
+    return name
+
+
+@functools.cache
+def has_bf16(device: str = "cpu") -> bool:
+    """Whether bfloat16 matrix products are done by the hardware (emulated ones are slower than float32)."""
+    if device == "cuda":
+        return torch.cuda.is_bf16_supported()
+    capability = torch.cpu.get_capabilities() if hasattr(torch.cpu, "get_capabilities") else {}
+    flags = {k.lower() for k, v in capability.items() if v}
+    return bool(flags & {"avx512_bf16", "amx_bf16", "bf16"}) or _cpuinfo_bf16()
+
+
+def _cpuinfo_bf16() -> bool:
+    try:
+        with open("/proc/cpuinfo") as handle:
+            text = handle.read()
+    except OSError:
+        return False
+    return "avx512_bf16" in text or "amx_bf16" in text
+
+
+def autocast(device: str, enabled: bool):
+    """Autocast to bfloat16 where `enabled` and the hardware has it."""
+    if enabled and has_bf16(device):
+        return torch.autocast(device, torch.bfloat16)
+    return contextlib.nullcontext()

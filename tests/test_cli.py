@@ -1,0 +1,87 @@
+"""The command line: fast, one sentence for each mistake, the right exit codes."""
+import subprocess
+import sys
+import time
+
+import pytest
+
+from pdkit import cli
+from pdkit.errors import PdkitError
+
+
+def pdkit(*arguments, cwd=cli.ROOT):
+    return subprocess.run([sys.executable, "-m", "pdkit", *arguments], capture_output=True, text=True, cwd=cwd)
+
+
+def test_help_is_fast_and_loads_no_package():
+    code = "import sys; from pdkit.cli import main; main([]); print({'torch', 'numpy'} & set(sys.modules))"
+    start = time.monotonic()
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=cli.ROOT)
+    assert done.stdout.splitlines()[-1] == "set()" and time.monotonic() - start < 5
+    assert all(f"  {verb} " in done.stdout for verb in cli.VERBS)
+
+
+def test_help_runs_without_site_packages():  # before the set-up, `pd` runs it with whatever Python there is
+    done = subprocess.run([sys.executable, "-S", "-m", "pdkit", "--help"], capture_output=True, text=True, cwd=cli.ROOT)
+    assert done.returncode == 0 and "usage: pdkit VERB" in done.stdout, done.stderr
+
+
+@pytest.mark.parametrize("arguments, sentence", [
+    (["tset"], f"Unknown verb 'tset'; choose one of: {', '.join(sorted(cli.VERBS))}. Did you mean 'test'?"),
+    (["nb", "--nope"], "pdkit nb: unrecognized arguments: --nope; `pdkit nb --help` lists what it takes."),
+    (["doctor", "x"], "pdkit doctor: unrecognized arguments: x; `pdkit doctor --help` lists what it takes."),
+])
+def test_bad_input_is_one_sentence_on_stderr_and_exit_code_2(arguments, sentence):
+    done = pdkit(*arguments)
+    assert (done.returncode, done.stdout, done.stderr) == (2, "", sentence + "\n")
+
+
+@pytest.mark.parametrize("raised, code, said", [
+    (PdkitError("It broke; mend it."), 2, "It broke; mend it."),
+    (KeyboardInterrupt(), 130, "Interrupted"),
+])
+def test_exit_codes_and_arguments_passed_on(monkeypatch, capsys, raised, code, said):
+    seen = []
+
+    def verb(argv):
+        seen.append(argv)
+        raise raised
+
+    monkeypatch.setattr(cli, "_function", lambda name: verb)
+    assert cli.main(["run", "--seed", "3"]) == code and seen == [["--seed", "3"]]
+    error = capsys.readouterr().err.strip()
+    assert error.startswith(said) and len(error.splitlines()) == 1
+
+
+def test_a_missing_package_is_named_with_the_fix(monkeypatch, capsys):
+    monkeypatch.setitem(cli.VERBS, "bench", ("", "surely_not_installed.bench:main"))
+    assert cli.main(["bench"]) == 2
+    assert "'surely_not_installed' is not installed" in capsys.readouterr().err
+
+
+def test_a_closed_pipe_is_no_traceback():
+    command = f"{sys.executable} -m pdkit --help | true"
+    done = subprocess.run(["sh", "-c", command], capture_output=True, text=True, cwd=cli.ROOT)
+    assert "Traceback" not in done.stderr
+
+
+def test_the_test_verb_runs_pytest_with_one_thread_and_passes_arguments_on(tmp_path):
+    inner = tmp_path / "test_inner.py"
+    threads = "os.environ['OMP_NUM_THREADS']"
+    inner.write_text(f"import os\ndef test_a(): assert {threads} == '1'\ndef test_b(): assert False\n")
+    (tmp_path / "pytest.ini").write_text("[pytest]\n")
+    plain = ["-q", "-c", tmp_path / "pytest.ini", "--rootdir", tmp_path, "-p", "no:cacheprovider", inner]
+    assert pdkit("test", *plain, "-k", "test_a").returncode == 0
+    assert pdkit("test", *plain).returncode == 1
+
+
+def test_lab_opens_the_notebooks_folder(monkeypatch, tmp_path):
+    (tmp_path / "notebooks").mkdir()
+    monkeypatch.setattr(cli, "ROOT", tmp_path)
+    monkeypatch.chdir(tmp_path)
+    seen = []
+    monkeypatch.setattr(cli.os, "execv", lambda path, argv: seen.append((path, argv, cli.os.getcwd())))
+    cli.main(["lab", "--port", "9000"])
+    (path, argv, folder), = seen
+    assert path == sys.executable and argv[1:3] == ["-m", "jupyterlab"] and argv[-2:] == ["--port", "9000"]
+    assert folder == str((tmp_path / "notebooks").resolve())
