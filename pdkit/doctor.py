@@ -19,8 +19,7 @@ from importlib import metadata
 from pathlib import Path
 
 from .errors import PdkitError
-from .files import DATA, ROOT, read_json, sha256
-from .nb import runs_root
+from .files import DATA, ROOT, read_json, runs_root, sha256
 
 REINSTALL = "run ./pd doctor, or pip install -r environment.txt"
 TIMEOUT = 60  # seconds a probe may take; a busy machine is slow, a hung driver never ends

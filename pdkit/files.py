@@ -1,13 +1,13 @@
 """Writing files so that a crash, a full disk or Ctrl-C never leaves half of one, and reading them with clear errors."""
 from __future__ import annotations
 
+import contextlib
 import errno
 import hashlib
 import json
 import os
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,11 @@ from .errors import PdkitError
 
 ROOT = Path(__file__).resolve().parent.parent
 DATA = ROOT / "data"
+
+
+def runs_root() -> Path:
+    """Where results go: runs/ in the project, or the folder that PDKIT_RUNS names."""
+    return Path(os.environ.get("PDKIT_RUNS") or ROOT / "runs").expanduser().resolve()
 
 
 def _told(error: OSError, target: Path) -> PdkitError:
@@ -25,7 +30,7 @@ def _told(error: OSError, target: Path) -> PdkitError:
     return PdkitError(f"Cannot write {target}: {error.strerror or error}.")
 
 
-@contextmanager
+@contextlib.contextmanager
 def atomic_file(path: str | Path) -> Iterator[Path]:
     """Yield a temporary path beside `path`; on success rename it onto `path`, on failure remove it.
 
@@ -40,10 +45,11 @@ def atomic_file(path: str | Path) -> Iterator[Path]:
     except OSError as error:
         raise _told(error, path) from error
     finally:
-        temporary.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
 
 
-@contextmanager
+@contextlib.contextmanager
 def atomic_folder(path: str | Path) -> Iterator[Path]:
     """The same for a folder: a reader sees the old one or the new one, never a mixture."""
     path = Path(path)

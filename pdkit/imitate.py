@@ -87,7 +87,7 @@ def imitate(kind: str, demos: Demos, config: ImitateConfig | None = None, policy
         optimizer.step()
         if iteration % config.eval_every and iteration < config.iterations:
             continue
-        row = {"iteration": iteration, "seconds": time.monotonic() - started, **{k: float(v) for k, v in terms.items()}}
+        row = {"iteration": iteration, "seconds": time.monotonic() - started, **{k: float(v.detach()) for k, v in terms.items()}}
         if not np.isfinite(row["loss"]):
             raise PdkitError(f"The imitation loss became {row['loss']} at iteration {iteration}; lower lr (now {config.lr}).")
         score = float(iteration)  # without evaluations the latest wins

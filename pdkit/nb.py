@@ -11,16 +11,11 @@ from pathlib import Path
 from typing import Any
 
 from .errors import PdkitError, unknown
-from .files import ROOT, read_json, write_json
+from .files import ROOT, read_json, runs_root, write_json
 
 NOTEBOOKS = ROOT / "notebooks"
 RESULT = "result.json"  # its presence alone says that a notebook came to its end
 PROGRESS_FILE = "PDKIT_PROGRESS"  # environment variable: where a kernel leaves its progress line for the runner
-
-
-def runs_root() -> Path:
-    """Where results go: runs/ in the project, or the folder that PDKIT_RUNS names."""
-    return Path(os.environ.get("PDKIT_RUNS") or ROOT / "runs").expanduser().resolve()
 
 
 # ---- what a notebook calls -------------------------------------------------------------------------------------------

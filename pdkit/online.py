@@ -102,9 +102,9 @@ def demo_rows(demos: Demos, base: Policy, config: OnlineConfig) -> list[np.ndarr
 class Trainer:
     """State of one online run. `train()` runs it to the end; `save` and `load` are its checkpoint."""
 
-    def __init__(self, config: OnlineConfig, base: Policy, demos: Demos | None = None):
+    def __init__(self, config: OnlineConfig, base: Policy, demos: Demos | None = None, spec: TaskSpec | None = None):
         self.config, self.base = config, base.eval()
-        self.spec: TaskSpec = get_task(config.task)
+        self.spec = spec or get_task(config.task)  # a spec of its own for worlds outside the registry, such as the probes
         if base.chunk != 1:
             raise PdkitError("The online loop decorates policies that return one action at a time.")
         if base.config["obs_dim"] != self.spec.obs_dim or base.config["act_dim"] != self.spec.act_dim:
@@ -232,15 +232,19 @@ class Trainer:
 
     def _row(self) -> dict:
         values = {name: float(value) for name, value in self.log.items()}
-        if not all(np.isfinite(v) for v in values.values()):
-            raise PdkitError(f"Training stopped at step {self.step}: {', '.join(k for k, v in values.items() if not np.isfinite(v))} is no "
-                             "longer a number; the last checkpoint is good: lower the learning rates, or set bf16=False, and resume.")
+        self._must_be_finite(values)
         episodes, self.recent = self.recent, []
         if episodes:
             values |= {"train_success": float(np.mean([e.success_once for e in episodes])), "train_episodes": len(episodes),
                        "train_length": float(np.mean([e.length for e in episodes]))}
         return {"step": self.step, "updates": self.agent.updates, "seconds": self.train_seconds,
                 "gate": gate_probability(self.config.decorator, self.step), **values}
+
+    def _must_be_finite(self, values: dict[str, float]) -> None:
+        bad = [name for name, value in values.items() if not np.isfinite(value)]
+        if bad:
+            raise PdkitError(f"Training stopped at step {self.step}: {bad[0]} is no longer a number; the last checkpoint is good: lower the "
+                             "learning rates or set bf16=False in a new run.")
 
     def _evaluate(self) -> dict:
         # Evaluation must not disturb the random numbers of training: a base policy may draw from torch's global generator.
@@ -257,7 +261,9 @@ class Trainer:
         arrays = {f"envs.{k}": v for k, v in snapshot.items()} | {f"nstep.{k}": v for k, v in self.nstep.state().items()}
         arrays |= {"replay": self.replay.rows[: self.replay.size].cpu().numpy(), "episode_counts": np.array(self.episode_counts),
                    "generator": self.generator.get_state().numpy(), "torch_rng": torch.get_rng_state().numpy()}
-        arrays |= {f"agent.{k}": v.numpy() for k, v in self.agent.state().items()}
+        agent = self.agent.state()
+        self._must_be_finite({name: float(tensor.float().sum()) for name, tensor in agent.items()})
+        arrays |= {f"agent.{k}": v.numpy() for k, v in agent.items()}
         values = {"step": self.step, "train_seconds": self.train_seconds, "position": self.replay.position, "rows": self.rows,
                   "rng": self.rng.bit_generator.state, "recent": [vars(e) for e in self.recent],
                   "log": {k: float(v) for k, v in self.log.items()}}

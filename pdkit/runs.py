@@ -19,15 +19,11 @@ from .files import ROOT, atomic_file, atomic_folder, read_json, sha256, write_js
 PACKAGES = ("torch", "numpy", "gymnasium", "gymnasium-robotics", "mujoco", "mani-skill", "sapien")
 
 
-def runs_folder() -> Path:
-    """Where runs go: PDKIT_RUNS, or runs/ in the project."""
-    return Path(os.environ.get("PDKIT_RUNS") or ROOT / "runs")
-
-
 def _git() -> str:
     try:
         commit = subprocess.run(["git", "rev-parse", "HEAD"], cwd=ROOT, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
-        dirty = subprocess.run(["git", "status", "--porcelain"], cwd=ROOT, capture_output=True, text=True, check=True, timeout=10).stdout
+        status = ["git", "status", "--porcelain"]
+        dirty = subprocess.run(status, cwd=ROOT, capture_output=True, text=True, check=True, timeout=10).stdout
         return commit + ("+changes" if dirty.strip() else "")
     except (OSError, subprocess.SubprocessError):
         return "unknown"
@@ -97,7 +93,7 @@ class Run:
         from safetensors.numpy import save_file
 
         with atomic_folder(self.folder / "checkpoint") as temporary:
-            save_file({k: np.ascontiguousarray(v) for k, v in arrays.items()}, temporary / "arrays.safetensors")
+            save_file({k: np.array(v, order="C") for k, v in arrays.items()}, temporary / "arrays.safetensors")
             write_json(temporary / "state.json", values | {"sha256": sha256(temporary / "arrays.safetensors"), "time": time.time()})
 
     def load_checkpoint(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:

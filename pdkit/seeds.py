@@ -10,7 +10,7 @@ DEMOS = 0  # + i: scripted experts (below 1,000,000)
 ROLLOUT = 3_000_000  # + i: episodes recorded from agents
 
 
-def test_seeds(num: int) -> list[int]:
+def reported_seeds(num: int) -> list[int]:
     return list(range(TEST, TEST + num))
 
 

@@ -65,12 +65,13 @@ def test_a_closed_pipe_is_no_traceback():
     assert "Traceback" not in done.stderr
 
 
-def test_the_test_verb_runs_pytest_with_one_thread_and_passes_arguments_on(tmp_path):
+def test_the_test_verb_runs_pytest_with_one_thread_and_passes_arguments_on(tmp_path, monkeypatch):
     inner = tmp_path / "test_inner.py"
     threads = "os.environ['OMP_NUM_THREADS']"
     inner.write_text(f"import os\ndef test_a(): assert {threads} == '1'\ndef test_b(): assert False\n")
     (tmp_path / "pytest.ini").write_text("[pytest]\n")
     plain = ["-q", "-c", tmp_path / "pytest.ini", "--rootdir", tmp_path, "-p", "no:cacheprovider", inner]
+    monkeypatch.setenv("OMP_NUM_THREADS", "7")  # the verb's own setting wins
     assert pdkit("test", *plain, "-k", "test_a").returncode == 0
     assert pdkit("test", *plain).returncode == 1
 

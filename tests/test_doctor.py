@@ -28,8 +28,14 @@ def test_packages_are_compared_with_environment_txt(tmp_path):
     assert statuses(checks) == ["WARN", "FAIL"]
     assert "tested with 0.1" in checks[0].text and "surely-not-installed" in checks[1].text
     assert all(check.fix for check in checks)
-    environment.write_text("numpy==1.26.4\n")
-    assert statuses(doctor.check_packages(environment)) == ["OK"]
+
+
+def test_a_build_of_the_pinned_version_is_that_version(tmp_path, monkeypatch):
+    environment = tmp_path / "environment.txt"
+    environment.write_text("torch==2.13.0\n")
+    for version, status in (("2.13.0+cpu", "OK"), ("2.13.0+cu130", "OK"), ("2.13.1", "WARN")):
+        monkeypatch.setattr(doctor.metadata, "version", lambda name, version=version: version)
+        assert statuses(doctor.check_packages(environment)) == [status]
 
 
 def test_data_are_compared_with_their_checksums(tmp_path, monkeypatch):

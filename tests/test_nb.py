@@ -47,7 +47,8 @@ def folder(tmp_path, monkeypatch):
 
 SIMPLE = PARAMETERS.replace("name: Optional[str] = None", 'name = "x"')
 FINISH = ("import os, sys\nfrom pdkit import nb\n"
-          "nb.finish({'alpha': alpha, 'steps': steps, 'seeds': seeds, 'name': name, 'profile': profile, 'python': sys.executable, 'cwd': os.getcwd()}, out)")
+          "nb.finish({'alpha': alpha, 'steps': steps, 'seeds': seeds, 'name': name, 'profile': profile,"
+          "'python': sys.executable, 'cwd': os.getcwd()}, out)")
 
 
 def errors_in(path: Path) -> list[str]:

@@ -29,8 +29,8 @@ class Expert(Protocol):
 class StackCubeExpert:
     """Grasp the red cube, carry it above the green one, lower it, let go.
 
-    A proportional controller on the way to one waypoint after another; `noise` is the standard deviation of what is added
-    to the displacement (1 is 10 cm a step), for demonstrations that also show how to recover.
+    A proportional controller on the way to one waypoint after another; `noise` is the standard deviation of what is
+    added to the displacement (1 is 10 cm a step), for demonstrations that also show how to recover.
     """
 
     TOOL, RED, GREEN = slice(25, 28), slice(32, 35), slice(39, 42)  # positions within the observation
@@ -55,8 +55,11 @@ class StackCubeExpert:
         return np.append(move, gripper).astype(np.float32)
 
     def _advance(self, tool: np.ndarray, red: np.ndarray, green: np.ndarray) -> None:
-        """Go on to the next stage as far as its condition is met; several at once where they are met already."""
+        """Go on to the next stage, or past it where its condition is met already; start again with a dropped cube."""
         sideways = np.linalg.norm((red - green)[:2])
+        dropped = np.linalg.norm(tool - red) > 0.05 and abs(red[2] - green[2] - self.CUBE) > 0.01
+        if dropped and self._stage not in ("reach", "descend"):
+            self._stage = "reach"
         if self._stage == "reach" and np.linalg.norm((tool - red)[:2]) < 0.01 and tool[2] - red[2] < 0.11:
             self._stage = "descend"
         if self._stage == "descend" and np.linalg.norm(tool - red) < 0.012:
@@ -100,11 +103,11 @@ def scripted_episodes(
     noise: float = 0.0,
     progress: Callable[[int, int], None] | None = None,
 ) -> Iterator[dict[str, Any]]:
-    """Yield `num` successful episodes of the task's scripted expert, from the seeds `first_seed`, `first_seed` + 1, ...
+    """`num` successful episodes of the task's scripted expert, from the seeds `first_seed`, `first_seed` + 1, ...
 
     Each is a dict of observations (T + 1, obs_dim) float32, actions (T, act_dim) float32 as they were executed (noise
-    included), success (T,) bool and seed. An episode ends at its first success, as in ManiSkill 2; one that does not get
-    there within the task's limit is skipped. `progress(kept, tried)` is called after every episode.
+    included), success (T,) bool and seed. An episode ends at its first success, as in ManiSkill 2; one that does not
+    get there within the task's limit is skipped. `progress(kept, tried)` is called after every episode.
 
     Raises PdkitError for a task without an expert, for `num` < 1, for negative noise, and after 50 failures in a row.
     """
@@ -114,6 +117,12 @@ def scripted_episodes(
         raise PdkitError(f"The number of demonstrations must be at least 1, not {num}.")
     if not noise >= 0:
         raise PdkitError(f"The action noise must be 0 or more, not {noise}.")
+    return _successful_episodes(task_name, num, first_seed, noise, progress)
+
+
+def _successful_episodes(
+    task_name: str, num: int, first_seed: int, noise: float, progress: Callable[[int, int], None] | None
+) -> Iterator[dict[str, Any]]:
     task, expert = get_task(task_name), EXPERTS[task_name](noise)
     sim = task.make()
     try:
@@ -129,7 +138,7 @@ def scripted_episodes(
                 yield episode
             elif failures == GIVE_UP:
                 raise PdkitError(
-                    f"The {task_name} expert failed {GIVE_UP} times in a row with action noise {noise}; lower the noise."
+                    f"The {task_name} expert failed {GIVE_UP} times in a row at action noise {noise}; lower the noise."
                 )
     finally:
         sim.close()

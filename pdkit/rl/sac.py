@@ -2,7 +2,7 @@
 
     target   y = reward + discount * (min_i Qbar_i(s', a') - temperature * log pi(a_res' | s')),  a' = compose(base', a_res')
     critic   sum_i mean (Q_i(s, a) - y)^2
-    actor    mean (temperature * log pi(a_res | s) - min_i Q_i(s, compose(base, a_res)))
+    actor    mean (temperature * log pi(a_res | s) - min_i Q_i(s, compose(base, a_res))) + penalty * mean a_res^2
     temperature   -log_temperature * mean (log pi + target_entropy)
 
 log pi is that of the unscaled residual: alpha does not enter the entropy. Plain SAC is the case base = 0, alpha = 1.
@@ -40,6 +40,7 @@ class SACConfig:
     target_entropy_scale: float = 1.0  # target entropy = -scale * act_dim
     entropy_backup: bool = True  # the entropy term inside the target
     grad_clip: float = 50.0  # global norm, separately for each critic and the actor
+    residual_penalty: float = 0.0  # weight of mean a_res^2 in the actor's loss: no drift where the critic has no preference
     actor_every: int = 1  # critic updates per actor update
     average: float = 0.999  # decay of the averaged actor that evaluation uses; 0 evaluates the last weights
     bf16: bool = True  # autocast to bfloat16 where the hardware has it
@@ -52,7 +53,8 @@ class SACConfig:
 class SAC:
     """The learner. `normalize` maps observations (B, obs_dim) before any network sees them (identity by default)."""
 
-    def __init__(self, obs_dim: int, act_dim: int, config: SACConfig, decorator: DecoratorConfig, *, normalize=None, device: str = "cpu"):
+    def __init__(self, obs_dim: int, act_dim: int, config: SACConfig, decorator: DecoratorConfig, *, normalize=None,
+                 device: str = "cpu"):
         self.config, self.decorator, self.device = config, decorator, device
         self.normalize = normalize or (lambda obs: obs)
         c = config
@@ -116,7 +118,7 @@ class SAC:
         with autocast(self.device, self.config.bf16):
             residual, log_pi = self.actor.sample(actor_features(self.decorator, obs, batch["base"]), noise)
             value = self.critics(critic_features(self.decorator, obs, batch["base"], residual)).min(dim=0).values
-            loss = (temperature * log_pi - value).mean()
+            loss = (temperature * log_pi - value).mean() + self.config.residual_penalty * residual.square().mean()
         self.actor_optimizer.zero_grad(set_to_none=True)
         loss.backward()
         torch.nn.utils.clip_grad_norm_(self.actor.parameters(), self.config.grad_clip)
@@ -168,5 +170,6 @@ class SAC:
         return {"actor": self.actor, "critics": self.critics, "targets": self.targets, "average": self.average}
 
     def _optimizers(self):
-        optimizers = {"adam_actor": self.actor_optimizer, "adam_critic": self.critic_optimizer, "adam_temperature": self.temperature_optimizer}
+        optimizers = {"adam_actor": self.actor_optimizer, "adam_critic": self.critic_optimizer,
+                      "adam_temperature": self.temperature_optimizer}
         return {name: optimizer for name, optimizer in optimizers.items() if optimizer is not None}

@@ -1,8 +1,8 @@
 """Building ManiSkill 3 environments on machines without a Vulkan driver, and asking whether this one can draw.
 
-ManiSkill's `render_backend="none"` already leaves out render systems, visual shapes, cameras and lights. What remains is
-that its loaders construct SAPIEN materials and textures, which need a Vulkan device: here they get inert stand-ins while an
-environment is built. Physics is untouched, so the trajectories are the same with and without a driver.
+ManiSkill's `render_backend="none"` already leaves out render systems, visual shapes, cameras and lights. What remains
+is that its loaders construct SAPIEN materials and textures, which need a Vulkan device: here they get inert stand-ins
+while an environment is built. Physics is untouched, so the trajectories are the same with and without a driver.
 """
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from ..errors import PdkitError
 
 PICTURE = 256  # pixels a side of a rendered frame
 
-# Draws one picture on the first device that can, and prints the device's name. Run in a process of its own, because SAPIEN
-# may crash instead of raising where there is no driver. It avoids importing this package, to be quick.
+# Draws one picture on the first device that can, and prints the device's name. Run in a process of its own, because
+# SAPIEN may crash instead of raising where there is no driver.
 _PROBE = """
 import sapien
 for name in ("cuda", "cpu"):
@@ -71,7 +71,7 @@ def without_materials() -> Iterator[None]:
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Hide what ManiSkill, SAPIEN and gymnasium warn about at import and build: nothing in it is for a user to act on."""
+    """Hide what ManiSkill, SAPIEN and gymnasium warn about while importing and building: no user can act on it."""
     logger = logging.getLogger("mani_skill ")  # the trailing space is ManiSkill's
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -91,9 +91,9 @@ def quiet() -> Iterator[None]:
 
 @lru_cache(maxsize=1)
 def render_device() -> str | None:
-    """The device SAPIEN can draw on, "cuda" or "cpu", or None: found by drawing a picture in a subprocess, once a process."""
+    """The device SAPIEN can draw on, "cuda" or "cpu", or None: found once a process, by drawing in a subprocess."""
     try:
-        done = subprocess.run([sys.executable, "-W", "ignore", "-c", _PROBE], capture_output=True, text=True, timeout=120)
+        done = subprocess.run([sys.executable, "-c", _PROBE], capture_output=True, text=True, timeout=120)
     except subprocess.TimeoutExpired:
         return None
     words = done.stdout.split()
@@ -105,29 +105,31 @@ def require_rendering() -> str:
     device = render_device()
     if device is None:
         raise PdkitError(
-            "ManiSkill scenes cannot be drawn here because SAPIEN finds no working Vulkan driver; train and evaluate without "
-            "pictures, or install one (Debian 12: `apt install -t bookworm-backports mesa-vulkan-drivers`, its stock version "
-            "is too old; Ubuntu: `apt install mesa-vulkan-drivers`; NVIDIA: the driver with its graphics libraries)."
+            "ManiSkill scenes cannot be drawn here because SAPIEN finds no working Vulkan driver; go on without "
+            "pictures, or install one (Debian 12: mesa-vulkan-drivers from bookworm-backports, as its stock version is "
+            "too old; Ubuntu: mesa-vulkan-drivers; NVIDIA: the driver with its graphics libraries)."
         )
     return device
 
 
-def make_env(env_id: str, control_mode: str, render: bool = False, **kwargs: Any) -> Any:
-    """A stock ManiSkill 3 environment, CPU physics, state observations, sparse reward; unwrapped, so without a time limit.
+Camera = tuple[tuple[float, float, float], tuple[float, float, float]]  # where it is and what it looks at, metres
 
-    With `render` it can also draw (slower to build and to step); raises PdkitError where it cannot.
+
+def make_env(env_id: str, control_mode: str, camera: Camera | None = None, **kwargs: Any) -> Any:
+    """A stock ManiSkill 3 environment, unwrapped (no time limit): CPU physics, state observations, sparse reward.
+
+    With a `camera` it can also draw what that sees (seconds to build); raises PdkitError where nothing can be drawn.
     """
     options = dict(obs_mode="state", reward_mode="sparse", control_mode=control_mode, sim_backend="cpu")
-    if render:
-        camera = dict(width=PICTURE, height=PICTURE)
-        options |= dict(
-            render_backend=require_rendering(), render_mode="rgb_array", human_render_camera_configs=camera
-        )
+    device = require_rendering() if camera else None
     with quiet():
         import gymnasium
         import mani_skill.envs  # noqa: F401  # registers the tasks
+        from mani_skill.utils.sapien_utils import look_at
 
-        if render:
-            return gymnasium.make(env_id, **options, **kwargs).unwrapped
+        if camera:
+            view = dict(width=PICTURE, height=PICTURE, pose=look_at(*camera))
+            drawing = dict(render_backend=device, render_mode="rgb_array", human_render_camera_configs=view)
+            return gymnasium.make(env_id, **options, **drawing, **kwargs).unwrapped
         with without_materials():
             return gymnasium.make(env_id, render_backend="none", **options, **kwargs).unwrapped

@@ -1,0 +1,99 @@
+"""Checks of the exercises in the notebooks: each takes the student's function and names the likely mistake.
+
+A check prints one line and returns whether the exercise is solved; it never raises, so that an unsolved notebook runs to
+its end, unless `strict` is set (for grading): then what is wrong is a PdkitError.
+"""
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import torch
+
+from .errors import PdkitError
+from .policies import bet
+
+
+def _judge(name: str, complaints: Callable[[], Iterator[str]], strict: bool) -> bool:
+    """Print the verdict of `complaints`, which yields sentences about what is wrong; True if there is none."""
+    try:
+        wrong = next(complaints(), None)
+    except NotImplementedError:
+        wrong = "it is still to be written."
+    except Exception as error:  # whatever a student's code may raise
+        wrong = f"it raised {type(error).__name__}: {error}"
+    if wrong is None:
+        print(f"[solved] {name}")
+        return True
+    if strict:
+        raise PdkitError(f"The exercise {name} is not solved: {wrong}")
+    print(f"[not yet] {name}: {wrong}")
+    return False
+
+
+def first_success(answer: Callable, strict: bool = False) -> bool:
+    """01: the step, counted from 1, after which an episode was first solved; None if never."""
+    def complaints() -> Iterator[str]:
+        cases = (([0, 0, 1, 1], 3), ([1, 0, 0], 1), ([0, 1, 0], 2), ([0, 0, 0], None))
+        for success, expected in cases:
+            got = answer(np.array(success, bool))
+            if got == expected and (got is None) == (expected is None):
+                continue
+            if expected is None:
+                yield f"an episode that is never solved gives {got!r}, not None; argmax of all False is 0."
+            elif got == expected - 1:
+                yield f"for {success} it gives {got}: steps are counted from 1."
+            else:
+                yield f"for {success} it gives {got!r}, not {expected}."
+
+    return _judge("first_success", complaints, strict)
+
+
+def focal_loss(answer: Callable, strict: bool = False) -> bool:
+    """02: the mean of -(1 - p)^gamma log p for logits (B, K) and true classes (B,)."""
+    def complaints() -> Iterator[str]:
+        generator = torch.Generator().manual_seed(0)
+        logits, target = torch.randn((16, 5), generator=generator), torch.arange(16) % 5
+        for gamma in (0.0, 2.0):
+            got, expected = float(answer(logits, target, gamma)), float(bet.focal_loss(logits, target, gamma))
+            if abs(got - expected) < 1e-4 * expected:
+                continue
+            cross_entropy = float(bet.focal_loss(logits, target, 0.0))
+            if gamma and abs(got - cross_entropy) < 1e-4:
+                yield "gamma changes nothing: where is the factor (1 - p)^gamma?"
+            elif abs(got + expected) < 1e-4:
+                yield "the sign is wrong: log p is negative, a loss is positive."
+            elif abs(got - 16 * expected) < 1e-3:
+                yield "it is 16 times too large for a batch of 16: take the mean, not the sum."
+            else:
+                yield f"with gamma {gamma:g} it gives {got:.4f}, not {expected:.4f}."
+        extreme = float(answer(torch.tensor([[-200.0, 200.0]]), torch.tensor([0]), 2.0))
+        if not np.isfinite(extreme):
+            yield "it is not finite for a very unlikely true bin; use log_softmax instead of log(softmax)."
+
+    return _judge("focal_loss", complaints, strict)
+
+
+def gate(answer: Callable, strict: bool = False) -> bool:
+    """05: each environment's row kept with probability min(step / H, 1), else zero."""
+    def complaints() -> Iterator[str]:
+        residual = np.ones((4000, 3), np.float32)
+        out = np.asarray(answer(residual.copy(), 250, 1000, np.random.default_rng(0)))
+        if out.shape != residual.shape:
+            yield f"it gives an array of shape {out.shape}, not {residual.shape}."
+        on = out != 0
+        if (on.any(axis=1) != on.all(axis=1)).any():
+            yield "it switches single dimensions; a row is kept or zeroed as a whole."
+        if not np.isin(out, (0, 1)).all():
+            yield "it scales the residuals; the gate only keeps them or sets them to zero."
+        share = float(on[:, 0].mean())
+        if share in (0.0, 1.0):
+            yield "it switches all environments together; draw one number for each of them."
+        if abs(share - 0.75) < 0.03:
+            yield "at a quarter of H three quarters are on: the chance to be ON is step / H."
+        if abs(share - 0.25) > 0.03:
+            yield f"at a quarter of H a share of {share:.2f} is on, not 0.25."
+        if (np.asarray(answer(residual.copy(), 5000, 1000, np.random.default_rng(0))) == 0).any():
+            yield "beyond H something is still off; the probability stops at 1."
+
+    return _judge("gate", complaints, strict)

@@ -1,0 +1,92 @@
+"""`pdkit demos`: make demonstrations, or look at what there is."""
+from __future__ import annotations
+
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+from ..cli import Parser
+from ..errors import PdkitError
+from ..files import DATA, runs_root
+from ..tasks import TASKS, get_task
+from . import sources
+from .experts import EXPERTS
+from .format import Demos, load_demos, save_demos
+
+SOURCES = ("scripted", "agent", "human")
+
+
+def main(argv: list[str]) -> int:
+    parser = Parser(prog="pdkit demos", description="Make demonstrations of a task, or describe a file of them.")
+    parser.add_argument("task", nargs="?", help=f"one of: {', '.join(TASKS)}")
+    parser.add_argument("--num", type=int, default=100, help="episodes to make (default 100)")
+    parser.add_argument("--source", choices=SOURCES, help="who acts (default: a scripted expert where there is one, else the shipped agent)")
+    parser.add_argument("--first-seed", type=int, help="seed of the first episode (scripted: 0, agent: 3000000)")
+    parser.add_argument("--noise", type=float, default=0.0, help="standard deviation of Gaussian noise on the actions")
+    parser.add_argument("--tail", type=int, default=40, help="agent: steps kept after the first success")
+    parser.add_argument("--policy", help="agent: folder of a decorated policy (default: the shipped one)")
+    parser.add_argument("--out", help="file to write (default runs/demos/TASK-SOURCE-NUM.safetensors)")
+    parser.add_argument("--show", metavar="FILE", help="check and describe a file instead")
+    parser.add_argument("--list", action="store_true", help="describe the bundled files")
+    args = parser.parse_args(argv)
+    if args.show or args.list:
+        for path in [Path(args.show)] if args.show else sorted((DATA / "demos").glob("*.safetensors")):
+            describe(load_demos(path), path)
+        return 0
+    if not args.task:
+        raise PdkitError("Name a task, for example `pdkit demos StackCube --num 1000`, or use --list.")
+    if args.num < 1:
+        raise PdkitError(f"--num must be at least 1, not {args.num}.")
+    get_task(args.task)
+    source = args.source or ("scripted" if args.task in EXPERTS else "agent")
+    out = Path(args.out) if args.out else runs_root() / "demos" / f"{args.task}-{source}-{args.num}.safetensors"
+    out.parent.mkdir(parents=True, exist_ok=True)
+    demos = _make(args, source)
+    save_demos(demos, out)
+    describe(demos, out)
+    return 0
+
+
+def _make(args, source: str) -> Demos:
+    if source == "human":
+        return sources.human(args.task)
+    if source == "scripted":
+        return sources.scripted(args.task, args.num, args.first_seed or 0, args.noise, Progress(args.num))
+    from ..decorated import load_decorated
+
+    folder = Path(args.policy) if args.policy else DATA / "checkpoints" / args.task / "decorated"
+    first = 3_000_000 if args.first_seed is None else args.first_seed
+    command = f"pdkit demos {args.task} --source agent --num {args.num} --noise {args.noise} --tail {args.tail} --first-seed {first}"
+    command += f" --policy {args.policy}" if args.policy else ""
+    how = f"rollouts of a policy decorated by this project, action noise {args.noise}, successes only, cut {args.tail} steps after success"
+    return sources.from_agent(load_decorated(folder), args.task, args.num, first_seed=first, noise=args.noise, tail=args.tail, how=how,
+                              command=command, progress=Progress(args.num))
+
+
+class Progress:
+    """`kept of num, tried, time left` on one line of a terminal (every tenth part elsewhere)."""
+
+    def __init__(self, num: int):
+        self.num, self.started, self.shown = num, time.monotonic(), -1
+
+    def __call__(self, kept: int, tried: int) -> None:
+        passed = time.monotonic() - self.started
+        left = passed / max(kept, 1) * (self.num - kept)
+        line = f"{kept}/{self.num} kept of {tried} tried, about {left:.0f} s left"
+        if sys.stderr.isatty():
+            print(f"\r{line}   ", end="\n" if kept >= self.num else "", file=sys.stderr, flush=True)
+        elif kept * 10 // self.num > self.shown:
+            self.shown = kept * 10 // self.num
+            print(line, file=sys.stderr, flush=True)
+
+
+def describe(demos: Demos, path: Path) -> None:
+    """Print what a file holds."""
+    first = [int(np.argmax(e["success"])) + 1 for e in demos.episodes() if e["success"].any()]
+    print(f"{path}: {demos.num} {demos.label} demonstrations of {demos.task}, {int(demos.lengths.sum())} steps")
+    print(f"  made by: {demos.how}\n  again with: {demos.command}")
+    print(f"  length {demos.lengths.min()}-{demos.lengths.max()} (median {np.median(demos.lengths):.0f}); {len(first)} succeed"
+          + (f", first at step {min(first)}-{max(first)} (median {np.median(first):.0f})" if first else ""))
+    print(f"  sha256 of the arrays {demos.checksum}")

@@ -1,0 +1,113 @@
+"""Where demonstrations come from: bundled in data/demos, scripted experts, the project's agents, human ones through Minari."""
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from ..errors import PdkitError
+from ..files import DATA
+from ..policies import Policy
+from ..tasks import get_task
+from ..tasks.lanes import IDLE
+from ..tasks.vector import VectorEnv
+from .experts import scripted_episodes
+from .format import Demos, from_episodes, load_demos
+
+MINARI = {"Door": "D4RL/door/human-v2", "Pen": "D4RL/pen/human-v2", "Hammer": "D4RL/hammer/human-v2", "Relocate": "D4RL/relocate/human-v2"}
+
+
+def bundled(task: str) -> Demos:
+    """The demonstrations that come with the kit. Raises PdkitError when there are none for this task."""
+    get_task(task)
+    path = DATA / "demos" / f"{task}.safetensors"
+    if not path.exists():
+        have = ", ".join(sorted(p.stem for p in path.parent.glob("*.safetensors"))) or "none"
+        raise PdkitError(f"No demonstrations of {task} are bundled (there are: {have}); make some with `pdkit demos`.")
+    return load_demos(path)
+
+
+def scripted(task: str, num: int, first_seed: int = 0, noise: float = 0.0, progress: Callable[[int, int], None] | None = None) -> Demos:
+    """`num` successful episodes of the task's scripted expert."""
+    command = f"pdkit demos {task} --num {num} --first-seed {first_seed} --noise {noise}"
+    return from_episodes(task, list(scripted_episodes(task, num, first_seed, noise, progress)), label="scripted",
+                         how=f"closed-loop scripted expert, action noise {noise}, successful episodes, each ending at its success",
+                         command=command)
+
+
+def agent_episodes(policy, task: str, num: int, first_seed: int, noise: float, tail: int,
+                   progress: Callable[[int, int], None] | None = None) -> list[dict]:
+    """`num` successful episodes of a policy acting with Gaussian action noise, cut `tail` steps after their first success.
+
+    The noise makes the recorded actions, which are the ones executed, vary as a demonstrator's would; episodes that the
+    task's limit ends unsolved are dropped.
+    """
+    spec, kept, lanes = get_task(task), {}, min(num, 10)
+    queue = list(range(first_seed, first_seed + 4 * num))[::-1]
+    rng = np.random.default_rng(first_seed)
+    with VectorEnv(spec, lanes, lambda lane: queue.pop() if queue else IDLE, window=policy.window) as envs:
+        windows = envs.reset()
+        open_episodes = [[] for _ in range(lanes)]
+        finished = 0
+        while len(kept) < num and finished < 4 * num:
+            actions = policy.act(windows)
+            actions = np.clip(actions + noise * rng.standard_normal(actions.shape), -1, 1).astype(np.float32)
+            result = envs.step(actions)
+            for i in range(lanes):
+                if result.steps[i]:
+                    open_episodes[i].append((windows[i, -1], actions[i, 0], bool(result.reward[i]), result.final_windows[i, -1]))
+            for e in result.episodes:
+                finished += 1
+                steps, open_episodes[e.lane] = open_episodes[e.lane], []
+                if e.success_once:
+                    length = min(len(steps), 1 + next(t for t, s in enumerate(steps) if s[2]) + tail)
+                    steps = steps[:length]
+                    observations = np.stack([s[0] for s in steps] + [steps[-1][3]])
+                    kept[e.seed] = dict(observations=observations, actions=np.stack([s[1] for s in steps]),
+                                        success=np.array([s[2] for s in steps]), seed=e.seed)
+                if progress:
+                    progress(len(kept), finished)
+            windows = result.windows
+    if len(kept) < num:
+        raise PdkitError(f"Only {len(kept)} of {finished} episodes succeeded, {num} were asked for; use a better policy or less noise.")
+    return [kept[seed] for seed in sorted(kept)[:num]]
+
+
+def from_agent(policy: Policy, task: str, num: int, *, first_seed: int, noise: float, tail: int, how: str, command: str,
+               progress: Callable[[int, int], None] | None = None) -> Demos:
+    """Demonstrations made by an agent of this project."""
+    return from_episodes(task, agent_episodes(policy, task, num, first_seed, noise, tail, progress), label="agent", how=how,
+                         command=command, noise=noise, tail=tail)
+
+
+def human(task: str) -> Demos:
+    """The 25 human demonstrations of an Adroit task, through Minari. Raises PdkitError without a network or for another task.
+
+    Actions outside [-1, 1] (5.6 % of Door's, facts.md 5.2) are clipped, as the environment does. Success is judged from
+    what was recorded; only about a third of the Door episodes pass the threshold.
+    """
+    if task not in MINARI:
+        raise PdkitError(f"There are no human demonstrations of {task}; Minari has: {', '.join(MINARI)}.")
+    import minari
+
+    try:
+        dataset = minari.load_dataset(MINARI[task], download=True)
+        recorded = list(dataset.iterate_episodes())
+    except Exception as error:
+        raise PdkitError(f"The human demonstrations of {task} could not be fetched ({type(error).__name__}); they need a network the first "
+                         "time: use the bundled ones, or run `pdkit demos " + task + " --source human` where there is one.") from error
+    episodes = [dict(observations=e.observations, actions=np.clip(e.actions, -1, 1), success=_recorded_success(task, e), seed=-1)
+                for e in recorded]
+    return from_episodes(task, episodes, label="human", how="human teleoperation (Rajeswaran et al., 2018), through Minari "
+                         f"({MINARI[task]}), actions clipped to [-1, 1]", command=f"pdkit demos {task} --source human")
+
+
+def _recorded_success(task: str, episode) -> np.ndarray:
+    """Success after each step: the environment's own flag where it was recorded, else the task's rule on the observation."""
+    length = len(episode.actions)
+    infos = getattr(episode, "infos", None) or {}
+    if "success" in infos:
+        return np.asarray(infos["success"], bool).ravel()[-length:]
+    if task == "Door":
+        return episode.observations[1: length + 1, 28] >= 1.35  # the door's hinge
+    return np.asarray(episode.rewards) >= 10  # the bonus of a solved step in the dense reward

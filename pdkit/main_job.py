@@ -1,0 +1,116 @@
+"""The main job, `pdkit run`: notebook 05 without a browser, told beforehand, summed up afterwards, resumable."""
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shlex
+from pathlib import Path
+from typing import Any
+
+from . import nb
+from .cli import Parser
+from .errors import PdkitError
+from .files import read_json, runs_root
+from .online import OnlineConfig
+from .profiles import PROFILES, online_config
+
+NOTEBOOK = "05_policy_decorator"
+OWN_OPTIONS = ("task", "profile", "seed", "out")
+TRAINING = "training"  # the run folder of the training, inside the job's folder
+
+
+def expected_minutes(config: OnlineConfig, episodes: int) -> float:
+    """Minutes that training and the final evaluations take on two recent cores: a rough guide, from measured costs.
+
+    A gradient step on 256 transitions takes about 7 ms in bfloat16 and 2.5 times that in float32, and its cost grows
+    with the batch; a primitive step of simulator and base policy takes about 0.5 ms.
+    """
+    updates = config.utd * (config.total_steps - config.warmup_steps)
+    a_update = 0.007 * (config.batch / 256) * (1 if config.sac.bf16 else 2.5) * (config.sac.hidden / 256)
+    evaluations = config.eval_episodes * config.total_steps // max(1, config.eval_every) + 2 * episodes
+    return (updates * a_update + 0.0005 * (config.total_steps + 250 * evaluations)) / 60 + 0.4
+
+
+def duration(minutes: float) -> str:
+    """`minutes` in words, as exact as an estimate deserves."""
+    if minutes < 1:
+        return "less than a minute"
+    return f"about {minutes:.0f} minutes" if minutes < 90 else f"about {minutes / 60:.0f} hours"
+
+
+def command(parameters: dict[str, Any]) -> str:
+    """The shell line that runs the job with these notebook parameters again."""
+    named = [f"--{name} {parameters[name]}" for name in ("task", "profile", "seed") if name in parameters]
+    others = [shlex.quote(f"{name}={value}") for name, value in parameters.items() if name not in OWN_OPTIONS]
+    return " ".join(["./pd run", *named, *(f"-p {other}" for other in others)])
+
+
+def main(argv: list[str]) -> int:
+    """`pdkit run [--task T] [--profile P] [--seed N] [-p name=value ...]`; 0 when done, 130 when interrupted."""
+    parser = Parser(prog="pdkit run", description="Decorate a base policy by online RL, compare the two, write a page.")
+    parser.add_argument("--task", default="Door", help="Door or StackCube (default: Door)")
+    parser.add_argument("--profile", default="lesson", help=f"{', '.join(PROFILES)} (default: lesson)")
+    parser.add_argument("--seed", default="0", help="of the training (default: 0)")
+    parser.add_argument("-p", dest="parameters", metavar="NAME=VALUE", action="append", default=[],
+                        help="another parameter of the notebook, e.g. alpha=0.2; `pdkit nb 05 --list` names them")
+    parser.add_argument("--out", help="folder for the results (default: below runs/main, one for each set of values)")
+    args = parser.parse_args(argv)
+    values = _values(args)
+    config = configured(values)
+    out = Path(args.out).expanduser().resolve() if args.out else _folder(values)
+    print(f"{values['task']}, profile {values['profile']}, seed {values['seed']}: {_announcement(config, values, out)}\n"
+          f"Results go to {out}\nCtrl-C stops it; the same command goes on from the last checkpoint.", flush=True)
+    try:
+        result = nb.run_notebook(NOTEBOOK, values, out)
+    except KeyboardInterrupt:
+        print(f"\nInterrupted. {_where(out)} {command(values)}{f' --out {args.out}' if args.out else ''}")
+        return 130
+    print(*result["summary"], sep="\n")
+    return 0
+
+
+def _values(args: Any) -> dict[str, Any]:
+    """The notebook's parameters as asked for, checked and of the right types."""
+    from .nb_cells import from_text, parameters_of, parse_assignment
+
+    known = parameters_of(nb.find_notebook(NOTEBOOK))
+    pairs = [("task", args.task), ("profile", args.profile), ("seed", args.seed)]
+    pairs += [parse_assignment(text) for text in args.parameters]
+    names = [name for name, _ in pairs]
+    if twice := sorted({name for name in names if names.count(name) > 1}):
+        raise PdkitError(f"Parameter {twice[0]} is given twice (task, profile and seed have options of their own).")
+    typed = {name: from_text(text, known[name]) if name in known else text for name, text in pairs}
+    return nb.checked_parameters(NOTEBOOK, typed)
+
+
+def configured(values: dict[str, Any]) -> OnlineConfig:
+    """The training's configuration for the notebook's parameters: -1 stands for the profile's value."""
+    named = {name: values[name] for name in ("alpha", "H", "total_steps") if values.get(name, -1) != -1}
+    both = sorted(named.keys() & values.get("changes", {}).keys())
+    if both:
+        raise PdkitError(f"{both[0]} is given as a parameter and in changes; give it once.")
+    return online_config(values.get("task", "Door"), values.get("profile", "lesson"), values.get("seed", 0), **named,
+                         **values.get("changes", {}))
+
+
+def _folder(values: dict[str, Any]) -> Path:
+    """runs/main/TASK-PROFILE-seedN, with a short hash of the other values if any: the same ones find it again."""
+    others = {name: value for name, value in sorted(values.items()) if name not in OWN_OPTIONS}
+    mark = "-" + hashlib.sha256(json.dumps(others).encode()).hexdigest()[:8] if others else ""
+    return runs_root() / "main" / f"{values['task']}-{values['profile']}-seed{values['seed']}{mark}"
+
+
+def _announcement(config: OnlineConfig, values: dict[str, Any], out: Path) -> str:
+    if (out / TRAINING / "manifest.json").exists() and read_json(out / TRAINING / "manifest.json").get("finished"):
+        return "already trained here; only evaluated and pictured again (delete the folder to train anew)."
+    time = duration(expected_minutes(config, values.get("eval_episodes", 200)))
+    cores = os.cpu_count() or 1
+    return f"{config.total_steps:,} environment steps, {time} on 2 cores (this machine has {cores})."
+
+
+def _where(out: Path) -> str:
+    state = out / TRAINING / "checkpoint" / "state.json"
+    if not state.exists():
+        return "Nothing had been saved yet; start again with:"
+    return f"Training is saved up to step {read_json(state)['step']:,}; go on with:"

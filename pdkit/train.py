@@ -1,0 +1,184 @@
+"""`pdkit train`: base policies from demonstrations, and decorated ones over several seeds with the evidence recorded."""
+from __future__ import annotations
+
+import ast
+import dataclasses
+import os
+import sys
+import time
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from .cli import Parser
+from .decorated import save_decorated
+from .demos import Demos, load_demos, sources
+from .errors import PdkitError, unknown
+from .evaluate import evaluate
+from .files import DATA, atomic_file, runs_root, write_json
+from .imitate import ImitateConfig, imitate
+from .online import Trainer
+from .policies import POLICIES, Policy, load_policy, save_policy
+from .profiles import PROFILES, differences, flat, online_config
+from .runs import Run, describe_machine
+from .seeds import reported_seeds
+from .tasks import get_task
+from .torch_setup import set_threads
+
+
+def main(argv: list[str]) -> int:
+    parser = Parser(prog="pdkit train", description="Train a base policy, or decorate one.")
+    kinds = parser.add_subparsers(dest="kind", required=True, parser_class=Parser)
+    base = kinds.add_parser("base", help="imitate demonstrations")
+    base.add_argument("task")
+    base.add_argument("--policy", default="bet", help=f"one of: {', '.join(POLICIES)}")
+    base.add_argument("--demos", help="demonstration file (default: the bundled one)")
+    base.add_argument("--num-demos", type=int, help="use only the first so many")
+    base.add_argument("--out", help="folder of the checkpoint (default runs/base/TASK-POLICY)")
+    decorated = kinds.add_parser("decorated", help="improve a base policy by online RL on sparse reward")
+    decorated.add_argument("task")
+    decorated.add_argument("--profile", default="lesson", help=f"one of: {', '.join(PROFILES)}")
+    decorated.add_argument("--base", help="folder of the base policy (default: the shipped one)")
+    decorated.add_argument("--demos", help="demonstration file (default: the bundled one)")
+    decorated.add_argument("--num-demos", type=int, help="use only the first so many (default: as many as the base policy saw)")
+    decorated.add_argument("--seeds", type=int, nargs="+", default=[0])
+    decorated.add_argument("--episodes", type=int, default=200, help="test episodes (default 200)")
+    decorated.add_argument("--out", help="folder of the runs (default runs/train)")
+    decorated.add_argument("--record", help="name under data/results: rows are added to NAME.csv and NAME_curves.csv")
+    decorated.add_argument("--recipe", default="lesson", help="what to call this configuration in the record")
+    for one in (base, decorated):
+        one.add_argument("--threads", type=int, default=1)
+        one.add_argument("--set", metavar="NAME=VALUE", nargs="+", default=[], help="change a field of the configuration")
+    args = parser.parse_args(argv)
+    set_threads(args.threads)
+    return (_base if args.kind == "base" else _decorated)(args)
+
+
+def parse_settings(settings: list[str]) -> dict[str, Any]:
+    """NAME=VALUE strings as a dict, values read as Python literals (bare words as strings)."""
+    values = {}
+    for item in settings:
+        name, equals, text = item.partition("=")
+        if not equals or not name:
+            raise PdkitError(f"--set takes NAME=VALUE, not {item!r}.")
+        try:
+            values[name] = ast.literal_eval(text)
+        except (ValueError, SyntaxError):
+            values[name] = text
+    return values
+
+
+def base_demos(args) -> Demos:
+    """The demonstrations that the arguments name."""
+    demos = load_demos(args.demos) if args.demos else sources.bundled(args.task)
+    if demos.task != get_task(args.task).name:
+        raise PdkitError(f"{args.demos} holds demonstrations of {demos.task}, not of {args.task}.")
+    return demos.first(args.num_demos) if args.num_demos is not None else demos
+
+
+def _base(args) -> int:
+    if args.policy not in POLICIES:
+        raise unknown("policy", args.policy, POLICIES)
+    demos, settings = base_demos(args), parse_settings(args.set)
+    fields = {f.name for f in dataclasses.fields(ImitateConfig)}
+    architecture = {k: v for k, v in settings.items() if k in POLICIES[args.policy].defaults}
+    for name in settings:
+        if name not in fields | set(architecture):
+            raise unknown("field", name, fields | set(POLICIES[args.policy].defaults))
+    config = ImitateConfig(**{k: v for k, v in settings.items() if k in fields})
+    out = Path(args.out) if args.out else runs_root() / "base" / f"{args.task}-{args.policy}"
+    print(f"{args.policy} on {demos.num} demonstrations of {args.task} ({demos.label}): {config}", flush=True)
+    policy, history = imitate(args.policy, demos, config, architecture,
+                              progress=lambda row: print("  " + ", ".join(f"{k} {v:.3g}" for k, v in row.items()), flush=True))
+    best = max(history, key=lambda row: row.get("success_once", row["iteration"]))
+    save_policy(policy, out, {"task": args.task, "demos": demos.num, "demos_checksum": demos.checksum, "label": demos.label,
+                              "imitate": asdict(config), "selected": best, "command": "pdkit train " + " ".join(sys.argv[2:]),
+                              "machine": describe_machine()})
+    print(f"wrote {out}")
+    return 0
+
+
+def _decorated(args) -> int:
+    settings = parse_settings(args.set)
+    base_folder = Path(args.base) if args.base else DATA / "checkpoints" / args.task / "base"
+    get_task(args.task)
+    for seed in args.seeds:
+        base = load_policy(base_folder)
+        config = online_config(args.task, args.profile, seed, **settings)
+        if args.num_demos is None:
+            args.num_demos = _demos_of(base_folder)
+        print(f"{args.task}, seed {seed}: " + (str(differences(config, args.profile)) or "the profile unchanged"), flush=True)
+        out = Path(args.out or runs_root() / "train") / f"{args.task}-{args.recipe}-seed{seed}"
+        row = decorate(config, base, base_demos(args), out, args.episodes)
+        row |= {"recipe": args.recipe, "command": command_of(args, seed)}
+        print(", ".join(f"{k} {v}" for k, v in row.items()), flush=True)
+        if args.record:
+            curves = pd.read_csv(out / "metrics.csv").assign(task=args.task, seed=seed, recipe=args.recipe)
+            record(args.record, pd.DataFrame([row]), curves)
+    return 0
+
+
+def _demos_of(folder: Path) -> int | None:
+    from .policies.base import read_card
+
+    return read_card(folder)["info"].get("demos")
+
+
+def command_of(args, seed: int) -> str:
+    """The command that makes one row again."""
+    parts = ["pdkit train decorated", args.task, f"--profile {args.profile}", f"--seeds {seed}", f"--recipe {args.recipe}",
+             f"--episodes {args.episodes}", f"--threads {args.threads}"]
+    parts += [f"--base {args.base}"] if args.base else []
+    parts += [f"--demos {args.demos}"] if args.demos else []
+    parts += [f"--num-demos {args.num_demos}"] if args.num_demos else []
+    parts += ["--set " + " ".join(args.set)] if args.set else []
+    return " ".join(parts + ([f"--record {args.record}"] if args.record else []))
+
+
+def decorate(config, base: Policy, demos: Demos | None, out: Path, episodes: int) -> dict[str, Any]:
+    """Train (or resume) one seed in `out` and evaluate base and decorated on the same test seeds: one row of evidence."""
+    run = Run(out, "decorated", flat(config))
+    trainer = Trainer(config, base, demos)
+
+    def show(t: Trainer) -> None:
+        row = t.rows[-1]
+        score = f", success {row['success_once']:.2f}, at the end {row['success_at_end']:.2f}" if "success_once" in row else ""
+        if score or row["step"] % 5000 < config.log_every:
+            print(f"  step {row['step']}, {row['updates']} updates, {row['seconds'] / 60:.1f} min{score}", flush=True)
+
+    policy = trainer.train(run, show)
+    run.write_metrics(trainer.rows)
+    save_decorated(policy, out / "decorated", {"task": config.task, "seed": config.seed})
+    tables = {}
+    for name, actor in (("base", base), ("decorated", policy)):
+        actor.reset(0)
+        tables[name] = evaluate(trainer.spec, actor.act, reported_seeds(episodes), window=base.window, num_envs=50)
+        with atomic_file(out / f"{name}_episodes.csv") as temporary:
+            tables[name].to_csv(temporary, index=False)
+    evaluations = sum(row.get("eval_seconds", 0.0) for row in trainer.rows)
+    row = dict(task=config.task, policy=base.kind, seed=config.seed, train_minutes=round((trainer.train_seconds + evaluations) / 60, 2),
+               cores=describe_machine()["cores"], env_steps=trainer.step, updates=trainer.agent.updates, episodes=episodes,
+               base_success=round(float(tables["base"].success_once.mean()), 4),
+               base_success_at_end=round(float(tables["base"].success_at_end.mean()), 4),
+               decorated_success=round(float(tables["decorated"].success_once.mean()), 4),
+               decorated_success_at_end=round(float(tables["decorated"].success_at_end.mean()), 4),
+               load_average=round(os.getloadavg()[0], 1) if hasattr(os, "getloadavg") else None)
+    run.finish(**row)
+    return row
+
+
+def record(name: str, rows: pd.DataFrame, curves: pd.DataFrame) -> None:
+    """Add rows to data/results/NAME.csv and NAME_curves.csv, replacing those of the same task, recipe and seed."""
+    keys = ["task", "recipe", "seed"]
+    for path, new in ((DATA / "results" / f"{name}.csv", rows), (DATA / "results" / f"{name}_curves.csv", curves)):
+        if path.exists():
+            old = pd.read_csv(path)
+            mine = new[keys].drop_duplicates()
+            old = old.merge(mine, on=keys, how="left", indicator=True).query("_merge == 'left_only'").drop(columns="_merge")
+            new = pd.concat([old, new], ignore_index=True)
+        with atomic_file(path) as temporary:
+            new.to_csv(temporary, index=False, float_format="%.6g")
+    write_json(DATA / "results" / f"{name}_manifest.json", {"written": time.strftime("%Y-%m-%d"), "machine": describe_machine(),
+                                                           "again": sorted(set(pd.read_csv(DATA / 'results' / f'{name}.csv').command))})

@@ -1,0 +1,311 @@
+"""Episodes to look at: frames, contact sheets, videos, and how large a residual is along the way.
+
+Pictures are an extra everywhere. `try_render` tells, without any risk to the caller, whether a task can be drawn here
+and chooses MuJoCo's backend; a lesson that cannot draw prints the sentence it returns and goes on.
+"""
+from __future__ import annotations
+
+import base64
+import functools
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+import pandas as pd
+
+from .decorated import Decorated
+from .decorator import compose
+from .errors import PdkitError
+from .files import ROOT, atomic_file
+from .plots import COLORS, Picture, blank, styled
+from .policies import Policy
+from .tasks.spec import TaskSpec
+
+SWITCH = "PDKIT_RENDER"  # environment variable: "off" turns all pictures off
+EMBED_BYTES = 500_000  # largest video put into a page or a notebook
+FPS = 30
+
+# Cameras from which hand and object are seen throughout; the environments' own stand far away.
+CAMERAS = {
+    "Door": {"distance": 1.25, "azimuth": 55.0, "elevation": -35.0, "lookat": np.array([0.08, -0.12, 0.27])},
+    "Pen": {"distance": 0.7, "azimuth": 45.0, "elevation": -40.0, "lookat": np.array([0.0, -0.15, 0.25])},
+    "Hammer": {"distance": 0.9, "azimuth": 45.0, "elevation": -30.0, "lookat": np.array([0.0, -0.1, 0.2])},
+    "Relocate": {"distance": 1.1, "azimuth": 60.0, "elevation": -30.0, "lookat": np.array([0.0, -0.1, 0.25])},
+}
+
+Actor = Callable[[np.ndarray], np.ndarray]  # windows (N, window, obs_dim) -> action chunks (N, chunk, act_dim)
+
+
+@dataclass(frozen=True)
+class Clip:
+    """One episode of one policy."""
+
+    task: str
+    seed: int
+    success: np.ndarray  # (T,) bool, judged after each step
+    frames: list[np.ndarray] = field(default_factory=list)  # uint8 (height, width, 3); the first is the start
+    steps: list[int] = field(default_factory=list)  # the step after which each frame was taken, 0 for the first
+    label: str = ""  # the policy's name
+
+    @property
+    def length(self) -> int:
+        return len(self.success)
+
+    @property
+    def first_success(self) -> int | None:
+        """The step (counted from 1) after which the task was first solved, None if it never was."""
+        return int(np.argmax(self.success)) + 1 if self.success.any() else None
+
+    @property
+    def outcome(self) -> str:
+        """What happened, in words."""
+        return f"solved at step {self.first_success}" if self.success.any() else "not solved"
+
+    def solved_by(self, step: int) -> bool:
+        """Whether the task had been solved by then."""
+        return self.first_success is not None and step >= self.first_success
+
+
+# ---- whether pictures can be drawn ---------------------------------------------------------------------------------
+
+_PROBE = """
+from pdkit.tasks import get_task
+sim = get_task("Door").make(render=True)
+sim.reset(0)
+picture = sim.render()
+sim.close()
+assert picture.std() > 1, "the picture is empty"
+print("DRAWS")
+"""
+
+
+def try_render(spec: TaskSpec) -> str | None:
+    """None if episodes of this task can be drawn here, else one sentence that says why not.
+
+    The first call for a simulator draws a picture in a process of its own, so that a crash of a graphics driver cannot
+    take the caller with it. For MuJoCo it also sets MUJOCO_GL to a backend that works.
+    """
+    if os.environ.get(SWITCH, "").lower() in ("off", "0", "no"):
+        return f"Pictures are turned off ({SWITCH}=off); everything else runs the same."
+    return _try_mujoco() if spec.suite == "adroit" else _try_sapien()
+
+
+@functools.cache
+def _try_mujoco() -> str | None:
+    chosen = os.environ.get("MUJOCO_GL", "")
+    others = ("egl", "osmesa") if sys.platform.startswith("linux") else ("",)
+    reason = ""
+    for backend in dict.fromkeys((chosen, *others) if chosen else others):
+        environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
+        if backend:
+            environment["MUJOCO_GL"] = backend
+        try:
+            done = subprocess.run([sys.executable, "-W", "ignore", "-c", _PROBE], env=environment, capture_output=True,
+                                  text=True, timeout=120)
+        except subprocess.TimeoutExpired:
+            reason = reason or f"{backend or 'the default backend'} did not answer"
+            continue
+        if done.returncode == 0 and "DRAWS" in done.stdout:
+            if backend:
+                os.environ["MUJOCO_GL"] = backend
+            return None
+        last = (done.stderr.strip().splitlines() or [f"exit code {done.returncode}"])[-1]
+        reason = reason or f"{backend or 'the default backend'}: {last[:120]}"
+    return (f"No pictures: MuJoCo cannot draw here ({reason}); `pdkit doctor` names the package that is missing. "
+            "Everything else runs the same.")
+
+
+def _try_sapien() -> str | None:
+    from .tasks.maniskill_headless import render_device
+
+    if render_device():
+        return None
+    return ("No pictures: ManiSkill needs a working Vulkan driver to draw, and there is none; `pdkit doctor` tells how "
+            "to get one. Everything else runs the same.")
+
+
+# ---- recording -------------------------------------------------------------------------------------------------------
+
+def record(spec: TaskSpec, actor: Actor, seed: int, *, window: int = 1, steps: int | None = None, stride: int = 1,
+           label: str = "", pictures: bool = True) -> Clip:
+    """Run one whole episode from `seed` as `evaluate` does, keeping every `stride`-th frame and the last.
+
+    `actor` maps windows (1, window, obs_dim) to action chunks (1, chunk, act_dim); `steps` is the limit if it is not
+    the task's; without `pictures` no frame is drawn. Raises PdkitError where drawing does not work: ask `try_render`.
+    """
+    if stride < 1:
+        raise PdkitError(f"stride counts steps between frames and must be at least 1, not {stride}.")
+    sim, frames, taken, success = spec.make(render=pictures), [], [], []
+    try:
+        _aim(sim, spec.name)
+        observation = sim.reset(seed)
+        history, limit = np.repeat(observation[None], window, axis=0), steps or spec.max_episode_steps
+        if pictures:
+            frames, taken = [sim.render()], [0]
+        while len(success) < limit:
+            for action in np.clip(actor(history[None])[0], -1, 1)[: limit - len(success)]:
+                observation, solved = sim.step(action)
+                success.append(solved)
+                history = np.concatenate([history[1:], observation[None]])
+                if pictures and (len(success) % stride == 0 or len(success) == limit):
+                    frames.append(np.ascontiguousarray(sim.render()))
+                    taken.append(len(success))
+    finally:
+        sim.close()
+    return Clip(spec.name, int(seed), np.array(success, bool), frames, taken, label)
+
+
+def _aim(sim, task: str) -> None:
+    """Give a MuJoCo environment that draws our camera, before its first picture."""
+    renderer = getattr(getattr(sim, "_env", None), "mujoco_renderer", None)
+    if renderer is not None and task in CAMERAS:
+        renderer.default_cam_config = CAMERAS[task]
+
+
+def trace(spec: TaskSpec, policy: Decorated, seed: int, *, steps: int | None = None) -> pd.DataFrame:
+    """One row a step of the decorated policy's episode, for `plots.residual_figure`: step, base and residual (mean
+    absolute size per action dimension, the residual times alpha), success."""
+    rows = []
+
+    def watched(windows: np.ndarray) -> np.ndarray:
+        base, residual = policy.parts(windows)
+        rows.append({"base": np.abs(base).mean(), "residual": policy.config.alpha * np.abs(residual).mean()})
+        return compose(policy.config, base, residual)[:, None]
+
+    policy.reset(0)
+    clip = record(spec, watched, seed, window=policy.window, steps=steps, pictures=False)
+    return pd.DataFrame(rows).assign(step=np.arange(1, clip.length + 1), success=clip.success)
+
+
+def contrasts(spec: TaskSpec, base: Policy, decorated: Decorated, seeds: Sequence[int], count: int = 1, *,
+              tries: int = 6, stride: int = 3) -> list[tuple[Clip, Clip]]:
+    """Up to `count` pairs of episodes from `seeds` that the base fails and the decorated policy solves, with frames.
+
+    Each is run again, alone: matrix products round differently for one lane than for fifty, and a contact can turn that
+    into another outcome, so an episode that now comes out otherwise is passed over (at most `tries` are run).
+    """
+    pairs: list[tuple[Clip, Clip]] = []
+    for seed in seeds[:tries]:
+        if len(pairs) == count:
+            break
+        base.reset(0)
+        failed = record(spec, base.act, seed, window=base.window, stride=stride, label="base")
+        if failed.success.any():
+            continue
+        decorated.reset(0)
+        solved = record(spec, decorated.act, seed, window=decorated.window, stride=stride, label="decorated")
+        if solved.success.any():
+            pairs.append((failed, solved))
+    return pairs
+
+
+# ---- contact sheets and videos ---------------------------------------------------------------------------------------
+
+@styled
+def contact_sheet(clips: Sequence[Clip], columns: int = 8, labels: Sequence[str] | None = None) -> Picture:
+    """One row an episode, `columns` frames at the same steps in all rows, the last at the end; green: solved by then.
+
+    Frames stand closer until a while after the last first success, because little happens later.
+    """
+    if not clips or not all(clip.frames for clip in clips):
+        raise PdkitError("A contact sheet needs at least one recorded episode with frames.")
+    length = max(clip.length for clip in clips)
+    focus = min(length, int(1.5 * max((clip.first_success or 0 for clip in clips), default=0)) or length)
+    wanted = [*np.linspace(0, focus, columns - (focus < length)), *([length] if focus < length else [])]
+    height, width = clips[0].frames[0].shape[:2]
+    thumb, title = 1.35 * height / width, 0.24  # inches
+    total = (thumb + title) * len(clips)
+    figure, axes = blank(len(clips), columns, (1.35 * columns, total), layout=None)
+    figure.subplots_adjust(0.003, 0.03 / total, 0.997, 1 - title / total, wspace=0.02, hspace=title / thumb)
+    for row, clip in enumerate(clips):
+        for ax, step in zip(axes[row], wanted, strict=True):
+            i = int(np.abs(np.array(clip.steps) - step).argmin())
+            _thumbnail(ax, clip.frames[i], clip.steps[i], clip.solved_by(clip.steps[i]))
+        name = labels[row] if labels else clip.label
+        text = f"{name}  seed {clip.seed}: {clip.outcome}".strip()
+        color = COLORS["gained" if clip.success.any() else "lost"]
+        axes[row, 0].set_title(text, fontsize=9, color=color, pad=3)
+    return figure
+
+
+def _thumbnail(ax, frame: np.ndarray, step: int, solved: bool) -> None:
+    ax.imshow(frame)
+    ax.grid(False)
+    ax.set(xticks=[], yticks=[])
+    ax.spines[:].set(visible=True, linewidth=2.5 if solved else 0.8, color=COLORS["gained"] if solved else "#999999")
+    ax.text(0.03, 0.04, str(step), transform=ax.transAxes, color="white", fontsize=7.5,
+            bbox={"facecolor": "black", "alpha": 0.55, "pad": 1.5, "lw": 0})
+
+
+def annotated(clip: Clip) -> list[np.ndarray]:
+    """The frames with the policy's name, the step, a bar of time, and a green border once the task was solved."""
+    green = tuple(int(255 * c) for c in mpl.colors.to_rgb(COLORS["gained"]))
+    frames = []
+    for frame, step in zip(clip.frames, clip.steps, strict=True):
+        picture = np.ascontiguousarray(frame).copy()
+        height, width = picture.shape[:2]
+        if clip.solved_by(step):
+            for edge in (picture[:5], picture[-5:], picture[:, :5], picture[:, -5:]):
+                edge[...] = green
+        picture[-5:, : max(1, width * step // max(1, clip.length))] = green if clip.solved_by(step) else (230, 230, 230)
+        frames.append(_write(picture, f"{clip.label}  step {step}".strip(), (8, 6)))
+    return frames
+
+
+def _write(picture: np.ndarray, text: str, at: tuple[int, int]) -> np.ndarray:
+    from PIL import Image, ImageDraw, ImageFont
+
+    image = Image.fromarray(picture)
+    font = ImageFont.truetype(mpl.font_manager.findfont("DejaVu Sans"), max(10, picture.shape[0] // 18))
+    ImageDraw.Draw(image).text(at, text, fill="white", font=font, stroke_width=2, stroke_fill="black")
+    return np.asarray(image)
+
+
+def side_by_side(*clips: Clip) -> list[np.ndarray]:
+    """Annotated frames of several episodes next to each other; one that ends early keeps its last frame."""
+    if not clips or not all(clip.frames for clip in clips):
+        raise PdkitError("A video needs at least one recorded episode with frames.")
+    columns = [annotated(clip) for clip in clips]
+    return [np.hstack([c[min(i, len(c) - 1)] for c in columns]) for i in range(max(map(len, columns)))]
+
+
+def write_video(frames: Sequence[np.ndarray], path: str | Path, *, fps: int = FPS,
+                limit: int = EMBED_BYTES) -> Path | None:
+    """Write frames (height, width, 3) as an H.264 MP4 of at most about `limit` bytes, at a lower quality if need be.
+
+    Returns the path, or None where no encoder works: a video is an extra, like every picture.
+    """
+    import mediapy
+
+    path = Path(path)
+    if not len(frames):
+        raise PdkitError("A video needs at least one frame.")
+    height, width = (n - n % 2 for n in frames[0].shape[:2])  # H.264 halves the colour planes
+    frames = [frame[:height, :width] for frame in frames]
+    try:
+        import imageio_ffmpeg
+
+        mediapy.set_ffmpeg(imageio_ffmpeg.get_ffmpeg_exe())
+        for crf in (25, 31, 37, 43):
+            with atomic_file(path) as temporary:
+                mediapy.write_video(temporary, frames, fps=fps, crf=crf)
+            if path.stat().st_size <= limit:
+                break
+    except (RuntimeError, ImportError) as error:
+        print(f"No video: the encoder did not work ({str(error).splitlines()[0][:120]}).")
+        return None
+    return path
+
+
+def video_tag(path: str | Path, caption: str = "") -> str:
+    """HTML that plays a video with its bytes inside: for a page, or for a notebook as `HTML(video_tag(path))`."""
+    from html import escape
+
+    data = base64.b64encode(Path(path).read_bytes()).decode()
+    return (f'<video controls loop muted playsinline style="max-width:100%" title="{escape(caption, quote=True)}" '
+            f'src="data:video/mp4;base64,{data}"></video>')

@@ -1,0 +1,95 @@
+"""The scripted experts and the episodes they leave."""
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pdkit.demos import experts
+from pdkit.demos.experts import EXPERTS, StackCubeExpert, scripted_episodes
+from pdkit.errors import PdkitError
+from pdkit.tasks import get_task
+
+
+@pytest.fixture(scope="module")
+def episodes():
+    return list(scripted_episodes("StackCube", 20))
+
+
+def test_stack_cube_expert_succeeds_quickly(episodes):
+    assert episodes[-1]["seed"] <= 21  # at most 2 of 22 failed
+    lengths = [len(episode["actions"]) for episode in episodes]
+    assert 30 <= np.median(lengths) <= 40 and max(lengths) <= 100
+
+
+def test_episodes_end_at_their_first_success(episodes):
+    task = get_task("StackCube")
+    for episode in episodes:
+        steps = len(episode["actions"])
+        assert episode["observations"].shape == (steps + 1, task.obs_dim)
+        assert episode["actions"].shape == (steps, task.act_dim)
+        assert episode["observations"].dtype == episode["actions"].dtype == np.float32
+        assert np.abs(episode["actions"]).max() <= 1
+        assert episode["success"].dtype == bool and episode["success"].nonzero()[0].tolist() == [steps - 1]
+
+
+def test_episodes_replay_from_their_seed(episodes):
+    sim = get_task("StackCube").make()
+    for episode in episodes[:3]:
+        np.testing.assert_array_equal(sim.reset(episode["seed"]), episode["observations"][0])
+        for action, after in zip(episode["actions"], episode["observations"][1:], strict=True):
+            np.testing.assert_array_equal(sim.step(action)[0], after)
+
+
+def test_noise_is_in_the_actions_and_comes_from_the_seed(episodes):
+    noisy, again = (list(scripted_episodes("StackCube", 3, first_seed=5, noise=0.2)) for _ in range(2))
+    for one, two in zip(noisy, again, strict=True):
+        np.testing.assert_array_equal(one["actions"], two["actions"])
+    clean = next(episode for episode in episodes if episode["seed"] == noisy[0]["seed"])
+    difference = (noisy[0]["actions"][:5] - clean["actions"][:5])[:, :3]  # before the paths part too far
+    assert 0.05 < difference.std() < 0.5
+    np.testing.assert_array_equal(noisy[0]["actions"][:5, 3], clean["actions"][:5, 3])
+
+
+class Sometimes(StackCubeExpert):
+    """Fails every second episode, or always."""
+
+    always = False
+    episodes = 0
+
+    def reset(self, rng):
+        super().reset(rng)
+        Sometimes.episodes += 1
+
+    def act(self, observation):
+        if self.always or Sometimes.episodes % 2:
+            return np.zeros(4, np.float32)
+        return super().act(observation)
+
+
+def test_failures_are_skipped_and_counted(monkeypatch):
+    monkeypatch.setitem(EXPERTS, "StackCube", Sometimes)
+    calls = []
+    kept = list(scripted_episodes("StackCube", 2, first_seed=7, progress=lambda *counts: calls.append(counts)))
+    assert [episode["seed"] for episode in kept] == [8, 10]
+    assert calls == [(0, 1), (1, 2), (1, 3), (2, 4)]
+
+
+def test_an_expert_that_always_fails_is_given_up(monkeypatch):
+    monkeypatch.setitem(EXPERTS, "StackCube", Sometimes)
+    monkeypatch.setattr(Sometimes, "always", True)
+    monkeypatch.setattr(experts, "GIVE_UP", 3)
+    with pytest.raises(PdkitError, match="lower the noise"):
+        list(scripted_episodes("StackCube", 1))
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        (("StackCub", 1), "Did you mean 'StackCube'"),
+        (("StackCube", 0), "at least 1"),
+        (("StackCube", 1, 0, -0.1), "noise"),
+    ],
+)
+def test_bad_arguments_are_told_at_once(arguments, message):
+    with pytest.raises(PdkitError, match=message):
+        scripted_episodes(*arguments)

@@ -1,0 +1,236 @@
+"""The online loop: what it stores, when it learns, and that killed and resumed runs give the same curve."""
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from pdkit.decorated import load_decorated, save_decorated
+from pdkit.decorator import DecoratorConfig
+from pdkit.demos.format import Demos
+from pdkit.errors import PdkitError
+from pdkit.online import OnlineConfig, Trainer, demo_rows, stops
+from pdkit.policies import BeT
+from pdkit.probes import PROBES, biased_base
+from pdkit.profiles import differences, flat, online_config
+from pdkit.rl.sac import SACConfig
+from pdkit.runs import Run
+
+SPEC = PROBES["reach"]
+SMALL = SACConfig(hidden=16, layers=2, bf16=False)
+
+
+def config(**changes):
+    values = dict(task="reach", total_steps=400, num_envs=4, env_workers=0, warmup_steps=100, batch=32, demo_fraction=0.0,
+                  eval_every=200, eval_episodes=4, log_every=100, checkpoint_every=100, normalize_obs=False, sac=SMALL,
+                  decorator=DecoratorConfig(alpha=0.6, H=300))
+    return OnlineConfig(**(values | changes))
+
+
+def columns(trainer):
+    return {k: v.numpy() for k, v in trainer.replay.unpack(trainer.replay.rows[: trainer.replay.size]).items()}
+
+
+@pytest.mark.parametrize(("rule", "at_success", "at_limit"), [("truncated", True, False), ("never", True, True), ("always", False, False)])
+def test_bootstrap_rules(rule, at_success, at_limit):
+    c = config(bootstrap=rule)
+    assert (stops(c, True, False), stops(c, False, True), stops(c, False, False)) == (at_success, at_limit, False)
+
+
+def test_what_is_stored():
+    trainer = Trainer(config(n_step=1, warmup="uniform", decorator=DecoratorConfig(alpha=0.6, H=0)), biased_base(), spec=SPEC)
+    trainer.train()
+    data = columns(trainer)
+    base = biased_base()
+    assert np.allclose(data["base"], base.act(data["obs"][:, None])[:, 0])
+    assert np.allclose(data["next_base"], base.act(data["next_obs"][:, None])[:, 0])
+    # the successor is what the executed sum led to, final observations of ended episodes included
+    executed = np.clip(data["base"] + 0.6 * data["residual"], -1, 1)
+    assert np.allclose(data["next_obs"][:, :2], np.clip(data["obs"][:, :2] + 0.2 * executed, -1.5, 1.5), atol=1e-5)
+    assert np.array_equal(data["obs"][:, 2:], data["next_obs"][:, 2:])  # never across episodes
+    solved = np.linalg.norm(data["next_obs"][:, :2] - data["next_obs"][:, 2:], axis=1) < 0.1
+    assert solved.any()
+    assert set(data["reward"][solved]) == {0.0} and set(data["reward"][~solved]) == {-1.0}  # shifted by -1
+    assert set(data["discount"][solved]) == {0.0}
+    assert np.allclose(data["discount"][~solved], 0.97)  # time limits bootstrap
+
+
+def test_reward_goes_on_after_success_when_episodes_do():
+    trainer = Trainer(config(on_success="continue", n_step=1), biased_base((0.0, 0.0)), spec=SPEC)
+    trainer.train()
+    data = columns(trainer)
+    assert (data["reward"] == 0).sum() > 50 and np.allclose(data["discount"], 0.97)
+
+
+@pytest.mark.parametrize(("warmup", "expected"), [("base", 0.0), ("uniform", 0.5)])
+def test_residuals_before_learning(warmup, expected):
+    trainer = Trainer(config(warmup=warmup, n_step=1, decorator=DecoratorConfig(alpha=0.6, H=0)), biased_base(), spec=SPEC)
+    trainer.train()
+    early = columns(trainer)["residual"][:96]
+    assert np.abs(early).mean() == pytest.approx(expected, abs=0.08)  # |uniform(-1, 1)| has mean 0.5
+    assert trainer.agent.updates == int((400 - 4 - 100) * 0.5)
+
+
+def test_the_gate_is_applied_while_training_and_not_in_evaluation():
+    trainer = Trainer(config(n_step=1, total_steps=3000, warmup="uniform", warmup_steps=2999, eval_every=0,
+                             decorator=DecoratorConfig(alpha=0.6, H=3000)), biased_base(), spec=SPEC)
+    trainer.train()
+    zero = (columns(trainer)["residual"] == 0).all(axis=1)
+    assert zero[:600].mean() > 0.8 and 0.35 < zero[1200:1800].mean() < 0.65 and zero[-600:].mean() < 0.2
+    windows = np.random.default_rng(0).normal(size=(8, 1, 4)).astype(np.float32)
+    fresh = Trainer(config(decorator=DecoratorConfig(alpha=0.6, H=10**9)), biased_base(), spec=SPEC).policy
+    with torch.no_grad():
+        fresh.actor.head.bias[:2] = 1.0
+    base, residual = fresh.parts(windows)
+    assert (np.abs(residual) > 0.5).all()
+    assert np.allclose(fresh.act(windows)[:, 0], base + 0.6 * residual)
+    assert np.array_equal(fresh.act(windows), fresh.act(windows))
+
+
+def test_the_base_policy_runs_once_for_each_window():
+    base = biased_base()
+    seen = []
+    act = base.act
+    base.act = lambda windows: (seen.append(len(windows)), act(windows))[1]
+    trainer = Trainer(config(eval_every=0), base, spec=SPEC)
+    trainer.train()
+    decisions, ended = 100, sum(trainer.episode_counts) - 4 * 2
+    assert sum(seen) == 4 * (decisions + 1) + ended
+
+
+def test_demo_rows_execute_the_demonstrated_action():
+    rng = np.random.default_rng(0)
+    observations, actions = rng.normal(size=(7, 4)).astype(np.float32), rng.uniform(-1, 1, (6, 2)).astype(np.float32)
+    success = np.array([0, 0, 0, 1, 1, 1], bool)
+    demos = Demos("reach", "scripted", "", "", observations, actions, success, np.array([6]), np.array([0]))
+    replay = Trainer(config(), biased_base(), spec=SPEC).replay
+    for rule, length in (("terminate", 4), ("continue", 6)):
+        rows = replay.unpack(torch.from_numpy(np.stack(demo_rows(demos, biased_base(), config(on_success=rule, n_step=1)))))
+        assert len(rows["reward"]) == length
+        assert np.allclose(rows["base"] + 0.6 * rows["residual"], actions[:length], atol=1e-5)
+        assert rows["reward"].tolist() == [-1, -1, -1, 0, 0, 0][:length]
+        assert (rows["discount"] == 0).tolist() == [False] * (length - 1) + [rule == "terminate"]
+
+
+def test_a_batch_mixes_in_the_asked_fraction_of_demonstrations():
+    rng = np.random.default_rng(0)
+    demos = Demos("reach", "scripted", "", "", rng.normal(size=(41, 4)).astype(np.float32), rng.uniform(-1, 1, (40, 2)).astype(np.float32),
+                  np.arange(40) == 39, np.array([40]), np.array([0]))
+    trainer = Trainer(config(demo_fraction=0.25), biased_base(), demos, spec=SPEC)
+    drawn = {"replay": 0, "demos": 0}
+    for name in drawn:
+        buffer = getattr(trainer, name)
+        draw = buffer.draw
+        buffer.draw = lambda n, g, name=name, draw=draw: (drawn.__setitem__(name, n), draw(n, g))[1]
+    trainer.train()
+    assert drawn == {"replay": 24, "demos": 8}
+    with pytest.raises(PdkitError, match="no demonstrations"):
+        Trainer(config(demo_fraction=0.25), biased_base(), spec=SPEC)
+
+
+def bet_base():
+    torch.manual_seed(0)
+    base = BeT(dict(obs_dim=4, act_dim=2, window=3, bins=2, layers=1, heads=2, embed=16, features=16, act_dropout=True))
+    rng = np.random.default_rng(0)
+    base.fit_statistics(rng.normal(size=(50, 4)).astype(np.float32), rng.uniform(-1, 1, (50, 2)).astype(np.float32))
+    return base.eval()
+
+
+@pytest.mark.parametrize("stochastic", [False, True])
+def test_killed_and_resumed_gives_the_same_curve(tmp_path, stochastic):
+    """Killed between checkpoints, resumed, against an uninterrupted run: same rows, same weights, bit for bit."""
+    make = bet_base if stochastic else biased_base
+    c = config(n_step=3)
+    whole = Trainer(c, make(), spec=SPEC)
+    whole.train(Run(tmp_path / "whole", "online", flat(c)))
+
+    def killed(trainer):
+        if trainer.step >= 280:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        Trainer(c, make(), spec=SPEC).train(Run(tmp_path / "cut", "online", flat(c)), killed)
+    resumed = Trainer(c, make(), spec=SPEC)
+    resumed.train(Run(tmp_path / "cut", "online", flat(c)))
+    timing = {"seconds", "eval_seconds"}
+    strip = lambda rows: [{k: v for k, v in row.items() if k not in timing} for row in rows]  # noqa: E731
+    assert strip(resumed.rows) == strip(whole.rows)
+    one, other = whole.agent.state(), resumed.agent.state()
+    assert one.keys() == other.keys() and all(torch.equal(one[k], other[k]) for k in one)
+    assert torch.equal(whole.replay.rows, resumed.replay.rows)
+
+
+def test_another_configuration_does_not_resume_a_run(tmp_path):
+    Run(tmp_path, "online", flat(config()))
+    with pytest.raises(PdkitError, match="differing: alpha"):
+        Run(tmp_path, "online", flat(config(decorator=DecoratorConfig(alpha=0.5, H=300))))
+
+
+def test_an_altered_checkpoint_is_refused(tmp_path):
+    run = Run(tmp_path, "online", {})
+    run.save_checkpoint({"x": np.arange(5)}, {"step": 3})
+    assert run.load_checkpoint()[0]["x"].tolist() == [0, 1, 2, 3, 4]
+    path = tmp_path / "checkpoint" / "arrays.safetensors"
+    path.write_bytes(path.read_bytes()[:-3])
+    with pytest.raises(PdkitError, match="truncated or altered"):
+        run.load_checkpoint()
+
+
+def test_nan_stops_with_one_sentence_and_keeps_the_last_good_checkpoint(tmp_path):
+    c = config(eval_every=0)
+    run = Run(tmp_path, "online", flat(c))
+    trainer = Trainer(c, biased_base(), spec=SPEC)
+
+    def poison(t):
+        if t.step >= 250:
+            with torch.no_grad():
+                next(t.agent.critics.parameters()).fill_(math.nan)
+
+    with pytest.raises(PdkitError, match="no longer a number"):
+        trainer.train(run, poison)
+    arrays, values = run.load_checkpoint()
+    assert values["step"] <= 300 and all(np.isfinite(v).all() for k, v in arrays.items() if k.startswith("agent."))
+
+
+def test_wrong_dimensions_and_ranges():
+    with pytest.raises(PdkitError, match="4 observations"):
+        Trainer(dataclasses.replace(config(), task="Door"), biased_base())
+    for bad in (dict(demo_fraction=1.0), dict(gamma=0.0), dict(n_step=0), dict(warmup="x"), dict(bootstrap="x"), dict(total_steps=50)):
+        with pytest.raises(PdkitError):
+            config(**bad)
+
+
+def test_profiles_reject_unknown_names_and_wrong_types():
+    assert online_config("Door", "lesson", alpha=0.2).decorator.alpha == 0.2
+    assert differences(online_config("Door", "lesson", alpha=0.25, utd=1), "lesson") == {"alpha": (0.1, 0.25), "utd": (0.5, 1.0)}
+    for bad in (dict(alhpa=0.2), dict(alpha="0.2"), dict(num_envs=2.5), dict(alpha=2.0)):
+        with pytest.raises(PdkitError):
+            online_config("Door", "lesson", **bad)
+    with pytest.raises(PdkitError, match="profile"):
+        online_config("Door", "leson")
+
+
+def test_the_paper_profile_is_the_official_recipe():
+    c = online_config("StackCube", "paper")
+    assert (c.sac.actor_lr, c.batch, c.utd, c.gamma, c.sac.tau, c.num_envs, c.warmup_steps) == (1e-4, 1024, 0.25, 0.97, 0.01, 16, 8000)
+    assert (c.decorator.alpha, c.decorator.H, c.total_steps, c.sac.init_temperature) == (0.03, 1_000_000, 3_000_000, 1.0)
+    assert (c.warmup, c.bootstrap, c.reward_shift, c.demo_fraction, c.n_step) == ("uniform", "truncated", -1.0, 0.0, 1)
+    assert (c.decorator.critic_input, c.decorator.actor_input, c.sac.critic_layer_norm, c.sac.average) == ("sum", "obs", False, 0.0)
+
+
+def test_decorated_policy_survives_the_disk(tmp_path):
+    base = bet_base()
+    trainer = Trainer(config(), base, spec=SPEC)
+    trainer.train()
+    base.config["act_dropout"] = False
+    policy = trainer.policy
+    policy.base.eval()
+    save_decorated(policy, tmp_path / "d", {"note": 1})
+    windows = np.random.default_rng(0).normal(size=(5, 3, 4)).astype(np.float32)
+    back = load_decorated(tmp_path / "d")
+    assert np.array_equal(back.act(windows), policy.act(windows))
+    weights = tmp_path / "d" / "actor.safetensors"
+    weights.write_bytes(weights.read_bytes()[:-8])
+    with pytest.raises(PdkitError, match="truncated"):
+        load_decorated(tmp_path / "d")

@@ -1,0 +1,138 @@
+"""Base policies: Behavior Transformer piece by piece, training, and the way to disk."""
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from pdkit.demos.format import from_episodes
+from pdkit.errors import PdkitError
+from pdkit.imitate import ImitateConfig, Windows, imitate
+from pdkit.policies import BeT, load_policy, save_policy
+from pdkit.policies.bet import focal_loss
+
+SMALL = dict(obs_dim=3, act_dim=2, window=4, bins=3, layers=2, heads=2, embed=16, features=16)
+
+
+def bet(**changes):
+    torch.manual_seed(0)
+    return BeT(SMALL | changes)
+
+
+def test_focal_loss_is_cross_entropy_weighted_by_one_minus_p_squared():
+    logits, target = torch.tensor([[2.0, 0.0, 0.0], [0.0, 1.0, 0.0]]), torch.tensor([0, 2])
+    p = torch.softmax(logits, -1)[torch.arange(2), target]
+    assert torch.allclose(focal_loss(logits, target, 2.0), (-((1 - p) ** 2) * p.log()).mean())
+    assert torch.allclose(focal_loss(logits, target, 0.0), torch.nn.functional.cross_entropy(logits, target))
+
+
+def test_attention_is_causal():
+    policy = bet(dropout=0.0).eval()
+    x = torch.randn(1, 4, 3)
+    changed = x.clone()
+    changed[0, 3] += 1
+    one, other = policy.gpt(x), policy.gpt(changed)
+    assert torch.allclose(one[0, :3], other[0, :3], atol=1e-6)
+    assert not torch.allclose(one[0, 3], other[0, 3])
+
+
+def test_bins_are_the_k_means_centres():
+    policy = bet()
+    centres = np.array([[0.8, 0.8], [-0.8, 0.8], [0.0, -0.8]], np.float32)
+    rng = np.random.default_rng(0)
+    actions = (centres[rng.integers(3, size=300)] + 0.02 * rng.normal(size=(300, 2))).astype(np.float32)
+    policy.fit_statistics(rng.normal(2, 5, (300, 3)).astype(np.float32), actions)
+    distance = torch.cdist(policy.centres, torch.from_numpy(centres)).min(dim=1).values
+    assert distance.max() < 0.02
+    assert policy.normalizer.std.mean() == pytest.approx(5, rel=0.1)
+    with pytest.raises(PdkitError, match="at least 3 actions"):
+        policy.fit_statistics(np.zeros((2, 3), np.float32), np.zeros((2, 2), np.float32))
+
+
+def test_offsets_are_learned_at_the_true_bin_only():
+    policy = bet(dropout=0.0)
+    policy.centres.copy_(torch.tensor([[0.0, 0.0], [5.0, 5.0], [-5.0, 5.0]]))
+    windows, actions = torch.randn(6, 4, 3), torch.full((6, 4, 2), 0.1)  # all in bin 0
+    policy.loss(windows, actions)["offset_mse"].backward()
+    gradient = policy.head.bias.grad[3:].view(3, 2)
+    assert (gradient[0] != 0).all() and (gradient[1:] == 0).all()
+    terms = policy.loss(windows, actions)
+    assert torch.allclose(terms["loss"], terms["focal"] + 1000 * terms["offset_mse"])
+
+
+def test_acting_takes_the_likeliest_bin_and_its_offset_at_the_last_position():
+    policy = bet(dropout=0.0).eval()
+    policy.centres.copy_(torch.tensor([[0.0, 0.0], [0.5, 0.5], [-0.5, 0.5]]))
+    with torch.no_grad():
+        policy.head.weight.zero_()
+        policy.head.bias.copy_(torch.tensor([0.0, 9.0, 0.0, 0.1, 0.1, 0.2, -0.2, 0.3, 0.3]))
+    action = policy.act(np.random.randn(2, 4, 3).astype(np.float32))
+    assert action.shape == (2, 1, 2) and np.allclose(action, [[[0.7, 0.3]]], atol=1e-6)
+
+
+def test_dropout_stays_on_only_when_asked():
+    x = np.random.default_rng(0).normal(size=(4, 4, 3)).astype(np.float32)
+    for on in (False, True):
+        policy = bet(act_dropout=on, dropout=0.5).eval()
+        policy.reset(0)
+        first, second = policy.act(x), policy.act(x)
+        assert np.array_equal(first, second) != on
+        policy.reset(0)
+        assert np.array_equal(policy.act(x), first)
+
+
+def line_demos(num=6, length=12):
+    """On Door's shapes: the action's first entry is the sign of the first observation, the second half its size."""
+    rng, episodes = np.random.default_rng(0), []
+    for _ in range(num):
+        observations = rng.normal(size=(length + 1, 39))
+        actions = np.zeros((length, 28))
+        actions[:, 0] = 0.7 * np.sign(observations[:-1, 0])
+        episodes.append(dict(observations=observations, actions=actions, success=np.zeros(length, bool)))
+    return from_episodes("Door", episodes, label="scripted", how="test", command="pytest")
+
+
+def test_windows_pair_each_observation_with_the_action_taken_there():
+    demos = line_demos()
+    for pad, count in ((True, 6 * 12), (False, 6 * 9)):
+        windows = Windows(demos, 4, pad)
+        assert len(windows.index) == count
+        observations, actions = windows.sample(200, torch.Generator().manual_seed(0))
+        assert observations.shape == (200, 4, 39)
+        assert torch.allclose(actions[..., 0], 0.7 * observations[..., 0].sign())
+    with pytest.raises(PdkitError, match="shorter than the window"):
+        Windows(demos, 50, False)
+
+
+@pytest.mark.parametrize(("kind", "config", "lr"), [("bet", dict(window=4, bins=2, layers=1, heads=2, embed=32, features=32), 3e-3),
+                                                    ("mlp", dict(hidden=64), 3e-3)])
+def test_imitation_learns(kind, config, lr):
+    demos = line_demos(20, 20)
+    settings = ImitateConfig(iterations=400, batch=64, lr=lr, eval_episodes=0, eval_every=400, bf16=False)
+    policy, history = imitate(kind, demos, settings, config)
+    observations, actions = Windows(demos, policy.window, True).sample(200, torch.Generator().manual_seed(1))
+    predicted = policy.act(observations.numpy())[:, 0, 0]
+    assert (np.sign(predicted) == np.sign(actions[:, -1, 0].numpy())).mean() > 0.95
+    assert len(history) == 1 and history[0]["loss"] < 5
+
+
+def test_save_and_load(tmp_path):
+    policy = bet(dropout=0.0).eval()
+    policy.normalizer.fit(np.random.default_rng(0).normal(3, 2, (50, 3)).astype(np.float32))
+    save_policy(policy, tmp_path / "p", {"success_once": 0.5})
+    x = np.random.default_rng(1).normal(size=(2, 4, 3)).astype(np.float32)
+    assert np.array_equal(load_policy(tmp_path / "p").act(x), policy.act(x))
+    card = tmp_path / "p" / "policy.json"
+    weights = tmp_path / "p" / "weights.safetensors"
+    whole, text = weights.read_bytes(), card.read_text()
+    for breakage in (lambda: weights.write_bytes(whole[:-20]), lambda: weights.unlink(), lambda: card.write_text("{"),
+                     lambda: card.unlink(),
+                     lambda: card.write_text(json.dumps(json.loads(text) | {"kind": "gan"})),
+                     lambda: card.write_text(json.dumps(json.loads(text) | {"config": SMALL | {"embed": 32}})),
+                     lambda: card.write_text('{"format": "other"}')):
+        breakage()
+        with pytest.raises(PdkitError) as error:
+            load_policy(tmp_path / "p")
+        assert "\n" not in str(error.value)
+        weights.write_bytes(whole)
+        card.write_text(text)

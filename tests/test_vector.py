@@ -1,0 +1,189 @@
+"""The vectorised environment: everything that corrupts results silently when it is wrong."""
+import dataclasses
+
+import numpy as np
+import pytest
+
+from pdkit.errors import PdkitError
+from pdkit.evaluate import evaluate
+from pdkit.probes import PROBES
+from pdkit.tasks import TASKS, get_task
+from pdkit.tasks.lanes import IDLE
+from pdkit.tasks.spec import TaskSpec
+from pdkit.tasks.vector import VectorEnv
+
+
+class CountSim:
+    """Observation (seed, steps so far); solved while the action's first entry is positive."""
+
+    def reset(self, seed):
+        self.seed, self.t = seed, 0
+        return np.array([seed, 0], np.float32)
+
+    def step(self, action):
+        self.t += 1
+        return np.array([self.seed, self.t], np.float32), bool(action[0] > 0)
+
+    def close(self): ...
+
+
+COUNT = TaskSpec("count", "probe", 2, 1, 4, "-", "-", False, CountSim)
+NO, YES = np.float32(-1), np.float32(1)
+
+
+def counting_seeds():
+    counts = [0, 0, 0]
+
+    def next_seed(lane):
+        counts[lane] += 1
+        return 10 * lane + counts[lane]
+
+    return next_seed
+
+
+def make(**kw):
+    return VectorEnv(COUNT, 2, counting_seeds(), **kw)
+
+
+def act(*values, chunk=1):
+    return np.repeat(np.array(values, np.float32)[:, None, None], chunk, axis=1)
+
+
+def test_time_limit_truncates_and_returns_the_true_final_observation():
+    env = make(window=2)
+    windows = env.reset()
+    assert windows[:, :, 0].tolist() == [[1, 1], [11, 11]]  # the first observation is repeated
+    for t in range(1, 5):
+        r = env.step(act(NO, NO))
+        assert r.final_windows[:, :, 1].tolist() == [[max(0, t - 1), t]] * 2
+    assert r.truncated.all() and not r.terminated.any()
+    assert r.final_windows[0].tolist() == [[1, 3], [1, 4]]  # the old episode's end, not the new one's start
+    assert r.windows[0].tolist() == [[2, 0], [2, 0]]  # the next episode, its window filled with its first observation
+    assert [e.length for e in r.episodes] == [4, 4] and not any(e.success_once for e in r.episodes)
+
+
+def test_success_terminates_only_when_asked_and_a_solved_last_step_is_a_termination():
+    env = make(terminate_on_success=True)
+    env.reset()
+    r = env.step(act(YES, NO))
+    assert r.terminated.tolist() == [True, False] and r.reward.tolist() == [1, 0] and not r.truncated.any()
+    for _ in range(2):
+        env.step(act(NO, NO))
+    r = env.step(act(NO, YES))  # lane 1's fourth and last step
+    assert r.terminated.tolist() == [False, True] and r.truncated.tolist() == [False, False]
+    env = make()
+    env.reset()
+    assert not env.step(act(YES, YES)).done.any()
+
+
+def test_success_once_and_at_end_differ():
+    env = make()
+    env.reset()
+    env.step(act(YES, NO))
+    for _ in range(2):
+        env.step(act(NO, NO))
+    episodes = env.step(act(NO, YES)).episodes
+    assert [(e.success_once, e.success_at_end) for e in episodes] == [(True, False), (True, True)]
+
+
+def test_chunks_sum_rewards_stop_at_the_end_and_count_primitive_steps():
+    env = make(chunk=3, window=2)
+    env.reset()
+    r = env.step(act(YES, NO, chunk=3))
+    assert r.steps.tolist() == [3, 3] and r.reward.tolist() == [3, 0]
+    assert r.windows[0, :, 1].tolist() == [2, 3]
+    r = env.step(act(NO, NO, chunk=3))
+    assert r.steps.tolist() == [1, 1] and r.truncated.all() and r.final_windows[0, :, 1].tolist() == [3, 4]
+
+
+def test_actions_are_clipped_and_wrong_shapes_refused():
+    seen = []
+
+    class Spy(CountSim):
+        def step(self, action):
+            seen.append(float(action[0]))
+            return super().step(action)
+
+    env = VectorEnv(dataclasses.replace(COUNT, make=Spy), 1, lambda lane: 1)
+    env.reset()
+    env.step(np.full((1, 1, 1), 7.0))
+    assert seen == [1.0]
+    with pytest.raises(PdkitError, match="shape"):
+        env.step(np.zeros((1, 2, 1)))
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_snapshot_restores_the_exact_episode(workers):
+    spec = PROBES["reach"]
+    rng = np.random.default_rng(0)
+    actions = rng.uniform(-1, 1, (30, 3, 1, 2)).astype(np.float32)
+
+    def seeds(start):
+        counts = [start] * 3
+
+        def next_seed(lane):
+            counts[lane] += 1
+            return 100 * lane + counts[lane]
+        return next_seed
+
+    with VectorEnv(spec, 3, seeds(0), window=4) as first, VectorEnv(spec, 3, seeds(2), window=4, workers=workers) as second:
+        first.reset()
+        for a in actions[:12]:
+            first.step(a)
+        windows = second.restore(first.snapshot())
+        assert np.array_equal(windows, first._windows)
+        for a in actions[12:]:
+            one, other = first.step(a), second.step(a)
+            assert np.array_equal(one.final_windows, other.final_windows) and np.array_equal(one.windows, other.windows)
+            assert one.episodes == other.episodes
+
+
+def test_workers_change_nothing_on_a_real_task():
+    spec, results = get_task("Door"), []
+    for workers in (0, 2):
+        with VectorEnv(spec, 3, lambda lane: 5 + lane, window=2, workers=workers, max_episode_steps=6) as env:
+            env.reset()
+            rng = np.random.default_rng(0)
+            results.append([env.step(rng.uniform(-1, 1, (3, 1, 28))) for _ in range(8)])
+    for one, other in zip(*results, strict=True):
+        assert np.array_equal(one.windows, other.windows) and one.episodes == other.episodes
+
+
+def test_idle_lanes_stay_idle():
+    queue = [3, 2, 1]
+    with VectorEnv(COUNT, 2, lambda lane: queue.pop() if queue else IDLE) as env:
+        env.reset()
+        finished = [e for _ in range(12) for e in env.step(act(YES, YES)).episodes]
+    assert sorted(e.seed for e in finished) == [1, 2, 3]
+
+
+def test_evaluation_counts_every_seed_once_in_order():
+    table = evaluate(COUNT, lambda windows: np.where(windows[:, -1, :1] > 6, YES, NO)[:, None], [9, 3, 8, 1, 7], num_envs=2)
+    assert table.seed.tolist() == [9, 3, 8, 1, 7]
+    assert table.success_once.tolist() == [True, False, True, False, True]
+    with pytest.raises(PdkitError):
+        evaluate(COUNT, lambda w: w, [])
+
+
+@pytest.mark.parametrize("name", ["Door", "Pen", "Hammer", "Relocate"])
+def test_adroit_tasks_are_what_the_registry_says(name):
+    spec = get_task(name)
+    sim = spec.make()
+    observation = sim.reset(0)
+    assert observation.shape == (spec.obs_dim,) and observation.dtype == np.float32
+    actions = np.random.default_rng(0).uniform(-1, 1, (20, spec.act_dim))
+    first = [sim.step(a)[0] for a in actions]
+    sim.reset(1)
+    sim.step(actions[0])
+    assert np.array_equal(sim.reset(0), observation)  # the seed alone decides, whatever came before
+    assert np.array_equal(first, [sim.step(a)[0] for a in actions])
+    assert not np.array_equal(sim.reset(1), observation)
+
+
+def test_episode_limits_are_the_papers():
+    assert {n: TASKS[n].max_episode_steps for n in TASKS} == dict(StackCube=200, Door=300, Pen=200, Hammer=400, Relocate=400)
+
+
+def test_unknown_task_names_the_known_ones():
+    with pytest.raises(PdkitError, match="Door.*Did you mean 'Door'"):
+        get_task("Dor")
