@@ -48,6 +48,7 @@ class OnlineConfig:
     n_step: int = 3
     gamma: float = 0.97
     reward_shift: float = -1.0  # added to the sparse 0/1 reward of every decision
+    train_limit: int = 0  # time limit of training episodes (0: the task's); shorter ones spend fewer steps on lost episodes
     on_success: str = "terminate"  # training episodes end when solved, or go on to the time limit
     bootstrap: str = "truncated"  # value of s' at an episode's end: only at time limits, never, or always
     normalize_obs: bool = True  # networks see observations through the base policy's normaliser (the paper's code: raw)
@@ -146,7 +147,7 @@ class Trainer:
         """
         c = self.config
         envs = VectorEnv(self.spec, c.num_envs, self._next_seed, window=self.base.window, workers=c.env_workers,
-                         terminate_on_success=c.on_success == "terminate")
+                         terminate_on_success=c.on_success == "terminate", max_episode_steps=c.train_limit or None)
         with envs:
             windows, base = self._start(envs, run)
             while self.step < c.total_steps:

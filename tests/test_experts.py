@@ -93,3 +93,16 @@ def test_an_expert_that_always_fails_is_given_up(monkeypatch):
 def test_bad_arguments_are_told_at_once(arguments, message):
     with pytest.raises(PdkitError, match=message):
         scripted_episodes(*arguments)
+
+
+def test_stack_cube_expert_picks_up_a_dropped_cube():
+    sim, expert = get_task("StackCube").make(), StackCubeExpert()
+    expert.reset(np.random.default_rng(0))
+    observation, success, drop, steps = sim.reset(0), False, 6, 0
+    while not success and steps < 120:
+        action = expert.act(observation)
+        if observation[34] > 0.09 and drop > 0:  # in the air: open the gripper
+            action, drop = np.float32([0, 0, 0, 1]), drop - 1
+        observation, success = sim.step(action)
+        steps += 1
+    assert drop < 6 and success

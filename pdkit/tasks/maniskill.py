@@ -128,7 +128,7 @@ def renew_physics(env: Any) -> Any:
     """Move all bodies of a ManiSkill scene, in their order, into a new physics system; return that system.
 
     Placing bodies anew is not enough to repeat an episode bit for bit: from the first contact on PhysX's results depend
-    on the contacts that were made before in the same system. A new one costs half a millisecond.
+    on the contacts that were made before in the same system. A new one costs a tenth of a millisecond.
     ManiSkill's scene is left pointing at the new system, so that its own methods keep working.
     """
     import sapien
@@ -164,7 +164,7 @@ class StackCube:
     """StackCube-v1, `pd_ee_delta_pos`, state observations: the fast step. See `Sim` for the methods."""
 
     def __init__(self, render: bool = False):
-        self._env = make_env("StackCube-v1", "pd_ee_delta_pos", render and CAMERA)
+        self._env = make_env("StackCube-v1", "pd_ee_delta_pos", CAMERA if render else None)
         self._can_render = render
         self._substeps = self._env._sim_steps_per_control
         self._panda = Panda(self._env)
@@ -215,7 +215,7 @@ class StockStackCube:
     """
 
     def __init__(self, render: bool = False):
-        self._env = make_env("StackCube-v1", "pd_ee_delta_pos", render and CAMERA)
+        self._env = make_env("StackCube-v1", "pd_ee_delta_pos", CAMERA if render else None)
         self._can_render = render
 
     def _with_base_pose(self, observation: Any) -> np.ndarray:
