@@ -5,15 +5,20 @@ import hashlib
 import json
 import os
 import shlex
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from . import nb
+from . import nb, page
 from .cli import Parser
 from .errors import PdkitError
 from .files import read_json, runs_root
 from .online import OnlineConfig
+from .plots import Picture
 from .profiles import PROFILES, online_config
+from .runs import Run
+from .stats import Paired
 
 NOTEBOOK = "05_policy_decorator"
 OWN_OPTIONS = ("task", "profile", "seed", "out")
@@ -44,6 +49,50 @@ def command(parameters: dict[str, Any]) -> str:
     named = [f"--{name} {parameters[name]}" for name in ("task", "profile", "seed") if name in parameters]
     others = [shlex.quote(f"{name}={value}") for name, value in parameters.items() if name not in OWN_OPTIONS]
     return " ".join(["./pd run", *named, *(f"-p {other}" for other in others)])
+
+
+@dataclass(frozen=True)
+class Report:
+    """What the job found, as sections of a page and as lines of text."""
+
+    task: str
+    run: Run  # of the training, finished
+    once: Paired  # base against decorated, solved at any step
+    at_end: Paired  # the same, solved at the last step
+    command: str
+
+    def sections(self, curve: Picture, duel: Picture, correction: Picture, *, sheets: Sequence[tuple[str, Picture]] = (),
+                 film: Path | None = None, instead: str = "") -> list[page.Section]:
+        """The page: `sheets` are contact sheets by what happened (gained, lost); `instead` is said where there are none."""
+        manifest, trained = self.run.manifest, self.run.manifest["results"]
+        numbers = page.numbers([
+            (f"{self.once.base.value:.1%}", "base policy", str(self.once.base)),
+            (f"{self.once.other.value:.1%}", "decorated policy", str(self.once.other)),
+            (f"{self.at_end.other.value:.1%}", "decorated, solved at the last step", f"base: {self.at_end.base.value:.1%}"),
+            (f"{trained['train_minutes']:.1f} min", "of training",
+             f"{trained['env_steps']:,} steps, {trained['updates']:,} updates")])
+        seen = [page.figure(sheet, f"Episodes {what}: both policies from the same start. Green: solved by then.")
+                for what, sheet in sheets]
+        seen += [page.video(film, "The same episode: base policy left, decorated policy right.")] if film else []
+        made = {"started": manifest["started"], "finished": manifest["finished"], **manifest["machine"]}
+        return [
+            page.Section("Result", [numbers, f"{self.once.n} test episodes, the same for both. {self.once.method}."]),
+            page.Section("Learning curve", [page.figure(curve, "Dots: success on selection episodes, which are never the test episodes.")]),
+            page.Section("Who gains, who loses", [page.figure(duel, f"p = {self.once.p:.1g} (McNemar's exact test).")]),
+            page.Section("Episodes", seen or [instead]),
+            page.Section("The correction", [page.figure(correction)]),
+            page.Section("How to make it again", [page.code(self.command), page.details("Machine and versions", page.table(made)),
+                                                  page.details("All settings", page.table(manifest["parameters"]))])]
+
+    def summary(self, written: Path) -> list[str]:
+        """The result in a few lines."""
+        once, at_end, trained = self.once, self.at_end, self.run.manifest["results"]
+        difference = f"{100 * once.difference:+.1f} points ({100 * once.low:+.1f} to {100 * once.high:+.1f})"
+        return [f"base        {once.base}", f"decorated   {once.other}",
+                f"difference  {difference}; {len(once.gained)} episodes gained, {len(once.lost)} lost",
+                f"at the end  {at_end.base} -> {at_end.other}",
+                f"training    {trained['train_minutes']:.1f} minutes, {trained['env_steps']:,} environment steps, "
+                f"{trained['updates']:,} updates", f"policy      {self.run.folder / 'policy'}", f"page        {written}"]
 
 
 def main(argv: list[str]) -> int:

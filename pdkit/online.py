@@ -49,7 +49,8 @@ class OnlineConfig:
     gamma: float = 0.97
     reward_shift: float = -1.0  # added to the sparse 0/1 reward of every decision
     train_limit: int = 0  # time limit of training episodes (0: the task's); shorter ones spend fewer steps on lost episodes
-    on_success: str = "terminate"  # training episodes end when solved, or go on to the time limit
+    on_success: str = "terminate"  # training episodes end when solved, or go on
+    success_tail: int = 0  # those that go on are cut, as by a time limit, this many steps after the first success; 0: not
     bootstrap: str = "truncated"  # value of s' at an episode's end: only at time limits, never, or always
     normalize_obs: bool = True  # networks see observations through the base policy's normaliser (the paper's code: raw)
     lr_decay_from: float = 1.0  # fraction of the run after which the actor's learning rate falls linearly to a tenth
@@ -147,7 +148,8 @@ class Trainer:
         """
         c = self.config
         envs = VectorEnv(self.spec, c.num_envs, self._next_seed, window=self.base.window, workers=c.env_workers,
-                         terminate_on_success=c.on_success == "terminate", max_episode_steps=c.train_limit or None)
+                         terminate_on_success=c.on_success == "terminate", success_tail=c.success_tail,
+                         max_episode_steps=c.train_limit or None)
         with envs:
             windows, base = self._start(envs, run)
             while self.step < c.total_steps:
@@ -244,8 +246,8 @@ class Trainer:
     def _must_be_finite(self, values: dict[str, float]) -> None:
         bad = [name for name, value in values.items() if not np.isfinite(value)]
         if bad:
-            raise PdkitError(f"Training stopped at step {self.step}: {bad[0]} is no longer a number; the last checkpoint is good: lower the "
-                             "learning rates or set bf16=False in a new run.")
+            raise PdkitError(f"Training stopped at step {self.step}: {bad[0]} is no longer a number; the last checkpoint is good: "
+                             "lower the learning rates or set bf16=False in a new run.")
 
     def _evaluate(self) -> dict:
         # Evaluation must not disturb the random numbers of training: a base policy may draw from torch's global generator.

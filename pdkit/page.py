@@ -6,6 +6,8 @@ themselves write, so a name or an error message can hold any character.
 from __future__ import annotations
 
 import base64
+import inspect
+import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
@@ -88,6 +90,19 @@ def table(rows: Mapping[str, Any] | Sequence[Mapping[str, Any]]) -> Html:
     head = "".join(f"<th>{escape(str(name))}</th>" for name in (rows[0] if rows else ()))
     body = "".join("<tr>" + "".join(f"<td>{escape(_text(v))}</td>" for v in row.values()) + "</tr>" for row in rows)
     return Html(f'<div class="scroll"><table><tr>{head}</tr>{body}</table></div>')
+
+
+def details(title: str, *parts: Html) -> Html:
+    """Parts that are folded away until the title is clicked."""
+    return Html(f"<details><summary>{escape(title)}</summary>{''.join(parts)}</details>")
+
+
+def source(*objects: Any):
+    """Functions and classes of the library as a notebook shows code: the lines that matter, never a stale copy."""
+    from IPython.display import Markdown
+
+    parts = (textwrap.dedent(inspect.getsource(each)) for each in objects)
+    return Markdown("```python\n" + "\n".join(parts) + "```")
 
 
 def code(text: str) -> Html:

@@ -144,6 +144,7 @@ def _minutes(ax: Axes, metrics: pd.DataFrame, right: float) -> None:
     count = max(1, round(8 * steps[-1] / right))
     marks = mpl.ticker.MaxNLocator(count, integer=True).tick_values(0, max(seconds[-1] / unit, 1))
     marks = [m for m in marks if 0 <= m * unit <= seconds[-1]]
+    marks = marks[-1:] if count == 1 else marks  # no room for more
     top = ax.secondary_xaxis("top")
     top.set_xticks([float(np.interp(m * unit, seconds, steps)) for m in marks], [f"{m:g}" for m in marks])
     top.set_xlabel(name, fontsize=9, labelpad=2)

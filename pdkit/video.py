@@ -183,7 +183,7 @@ def trace(spec: TaskSpec, policy: Decorated, seed: int, *, steps: int | None = N
 
 
 def contrasts(spec: TaskSpec, base: Policy, decorated: Decorated, seeds: Sequence[int], count: int = 1, *,
-              tries: int = 6, stride: int = 3) -> list[tuple[Clip, Clip]]:
+              tries: int = 6, steps: int | None = None, stride: int = 3) -> list[tuple[Clip, Clip]]:
     """Up to `count` pairs of episodes from `seeds` that the base fails and the decorated policy solves, with frames.
 
     Each is run again, alone: matrix products round differently for one lane than for fifty, and a contact can turn that
@@ -194,11 +194,12 @@ def contrasts(spec: TaskSpec, base: Policy, decorated: Decorated, seeds: Sequenc
         if len(pairs) == count:
             break
         base.reset(0)
-        failed = record(spec, base.act, seed, window=base.window, stride=stride, label="base")
+        failed = record(spec, base.act, seed, window=base.window, steps=steps, stride=stride, label="base")
         if failed.success.any():
             continue
         decorated.reset(0)
-        solved = record(spec, decorated.act, seed, window=decorated.window, stride=stride, label="decorated")
+        solved = record(spec, decorated.act, seed, window=decorated.window, steps=steps, stride=stride,
+                        label="decorated")
         if solved.success.any():
             pairs.append((failed, solved))
     return pairs

@@ -76,6 +76,16 @@ def test_success_terminates_only_when_asked_and_a_solved_last_step_is_a_terminat
     assert not env.step(act(YES, YES)).done.any()
 
 
+def test_a_tail_cuts_an_episode_after_its_first_success_as_a_time_limit():
+    env = make(success_tail=2)
+    env.reset()
+    assert not env.step(act(YES, NO)).done.any()
+    assert not env.step(act(YES, NO)).done.any()  # counted from the first success
+    r = env.step(act(NO, NO))
+    assert r.truncated.tolist() == [True, False] and not r.terminated.any()
+    assert [(e.length, e.success_once, e.success_at_end) for e in r.episodes] == [(3, True, False)]
+
+
 def test_success_once_and_at_end_differ():
     env = make()
     env.reset()

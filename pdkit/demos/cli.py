@@ -22,7 +22,7 @@ def main(argv: list[str]) -> int:
     parser = Parser(prog="pdkit demos", description="Make demonstrations of a task, or describe a file of them.")
     parser.add_argument("task", nargs="?", help=f"one of: {', '.join(TASKS)}")
     parser.add_argument("--num", type=int, default=100, help="episodes to make (default 100)")
-    parser.add_argument("--source", choices=SOURCES, help="who acts (default: a scripted expert where there is one, else the shipped agent)")
+    parser.add_argument("--source", choices=SOURCES, help="who acts (default: a scripted expert where there is one, else an agent)")
     parser.add_argument("--first-seed", type=int, help="seed of the first episode (scripted: 0, agent: 3000000)")
     parser.add_argument("--noise", type=float, default=0.0, help="standard deviation of Gaussian noise on the actions")
     parser.add_argument("--tail", type=int, default=40, help="agent: steps kept after the first success")

@@ -65,8 +65,8 @@ def agent_episodes(policy, task: str, num: int, first_seed: int, noise: float, t
                     observations = np.stack([s[0] for s in steps] + [steps[-1][3]])
                     kept[e.seed] = dict(observations=observations, actions=np.stack([s[1] for s in steps]),
                                         success=np.array([s[2] for s in steps]), seed=e.seed)
-                if progress:
-                    progress(len(kept), finished)
+                if progress and len(kept) <= num:
+                    progress(min(len(kept), num), finished)
             windows = result.windows
     if len(kept) < num:
         raise PdkitError(f"Only {len(kept)} of {finished} episodes succeeded, {num} were asked for; use a better policy or less noise.")

@@ -58,7 +58,8 @@ class SAC:
         self.config, self.decorator, self.device = config, decorator, device
         self.normalize = normalize or (lambda obs: obs)
         c = config
-        self.actor = Actor(decorator.actor_dim(obs_dim, act_dim), act_dim, c.hidden, c.layers, c.actor_layer_norm, c.log_std_range).to(device)
+        self.actor = Actor(decorator.actor_dim(obs_dim, act_dim), act_dim, c.hidden, c.layers, c.actor_layer_norm,
+                           c.log_std_range).to(device)
         self.critics = Critics(decorator.critic_dim(obs_dim, act_dim), c.hidden, c.layers, c.num_critics, c.critic_layer_norm).to(device)
         self.targets = copy.deepcopy(self.critics).requires_grad_(False)
         self.average = copy.deepcopy(self.actor).requires_grad_(False)

@@ -16,12 +16,12 @@ IDLE = -1  # instead of a seed: this lane has nothing more to do
 class _Lane:
     """One simulator with its episode bookkeeping; runs in the main process or in a worker."""
 
-    def __init__(self, sim, limit: int, terminate_on_success: bool):
-        self.sim, self.limit, self.terminate_on_success = sim, limit, terminate_on_success
-        self.seed, self.length, self.once = IDLE, 0, False
+    def __init__(self, sim, limit: int, terminate_on_success: bool, success_tail: int):
+        self.sim, self.full_limit, self.terminate_on_success, self.success_tail = sim, limit, terminate_on_success, success_tail
+        self.seed, self.length, self.once, self.limit = IDLE, 0, False, limit
 
     def reset(self, seed: int) -> np.ndarray:
-        self.seed, self.length, self.once = int(seed), 0, False
+        self.seed, self.length, self.once, self.limit = int(seed), 0, False, self.full_limit
         return self.sim.reset(self.seed)
 
     def step(self, chunk: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool, bool]:
@@ -30,7 +30,10 @@ class _Lane:
         for action in chunk:
             observation, success = self.sim.step(action)
             self.length += 1
-            self.once |= success
+            if success and not self.once:
+                self.once = True
+                if self.success_tail:
+                    self.limit = min(self.limit, self.length + self.success_tail)
             observations.append(observation)
             successes.append(success)
             terminated = self.terminate_on_success and success
@@ -43,8 +46,8 @@ class _Lane:
 class _Lanes:
     """A group of lanes stepped one after the other, writing into shared arrays."""
 
-    def __init__(self, spec: TaskSpec, count: int, limit: int, terminate_on_success: bool):
-        self.lanes = [_Lane(spec.make(), limit, terminate_on_success) for _ in range(count)]
+    def __init__(self, spec: TaskSpec, count: int, *rules):
+        self.lanes = [_Lane(spec.make(), *rules) for _ in range(count)]
 
     def step(self, arrays: dict[str, np.ndarray]) -> None:
         for i, lane in enumerate(self.lanes):
@@ -94,8 +97,8 @@ class InProcess:
 
     def __init__(self, shapes, num_envs: int, arguments):
         self.arrays = {name: np.zeros(shape, dtype) for name, (shape, dtype) in shapes.items()}
-        spec, limit, terminate = arguments
-        self._lanes = _Lanes(spec, num_envs, limit, terminate)
+        spec, *rules = arguments
+        self._lanes = _Lanes(spec, num_envs, *rules)
         self._pending = ""
 
     def send(self, command: str) -> None:
@@ -199,8 +202,8 @@ def _worker(pipe, names, shapes, part: slice, arguments) -> None:
     arrays = {name: np.ndarray(*shapes[name], buffer=block.buf)[part] for name, block in blocks.items()}
     lanes = None
     try:
-        spec, limit, terminate = arguments
-        lanes = _Lanes(spec, part.stop - part.start, limit, terminate)
+        spec, *rules = arguments
+        lanes = _Lanes(spec, part.stop - part.start, *rules)
         pipe.send("ready")
         while True:
             command, payload = pipe.recv()

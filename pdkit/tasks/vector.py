@@ -57,11 +57,12 @@ class VectorEnv:
         workers: 0 steps in this process; k splits the lanes over k processes, so that the caller can compute
             between `send` and `receive`. Results do not depend on it.
         terminate_on_success: end an episode when solved (training); otherwise it runs to the time limit.
+        success_tail: without termination, end an episode (as a time limit) this many steps after its first success; 0: never.
         max_episode_steps: another limit than the task's.
     """
 
     def __init__(self, spec: TaskSpec, num_envs: int, next_seed: Callable[[int], int], *, window: int = 1, chunk: int = 1,
-                 workers: int = 0, terminate_on_success: bool = False, max_episode_steps: int | None = None):
+                 workers: int = 0, terminate_on_success: bool = False, success_tail: int = 0, max_episode_steps: int | None = None):
         if num_envs < 1 or workers < 0 or window < 1 or chunk < 1:
             raise PdkitError("A vectorised environment needs num_envs, window and chunk >= 1 and workers >= 0.")
         self.spec, self.num_envs, self.window, self.chunk = spec, num_envs, window, chunk
@@ -74,7 +75,7 @@ class VectorEnv:
             "reward": ((num_envs,), np.float32), "steps": ((num_envs,), np.int64), "ended": ((num_envs, 2), np.bool_),
             "episode": ((num_envs, 4), np.int64),
         }
-        arguments = (spec, self.limit, terminate_on_success)
+        arguments = (spec, self.limit, terminate_on_success, success_tail)
         self._backend = Workers(shapes, num_envs, min(workers, num_envs), arguments) if workers else \
             InProcess(shapes, num_envs, arguments)
         self._arrays = self._backend.arrays

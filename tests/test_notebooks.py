@@ -1,0 +1,175 @@
+"""Every notebook keeps the conventions and runs headless in the smoke profile; so does the main job, which resumes."""
+import os
+import re
+import subprocess
+import sys
+
+import nbformat
+import pytest
+
+from pdkit import check, main_job, nb
+from pdkit.errors import PdkitError
+from pdkit.files import DATA, ROOT, read_json
+from pdkit.main_job import configured, expected_minutes
+
+NAMES = sorted(nb.notebooks())
+
+
+def run(name, out, cwd=ROOT, **parameters):
+    """Run a notebook as `pdkit nb` does, from the folder `cwd`, without pictures (tests/test_plots_video.py draws)."""
+    pairs = [word for key, value in parameters.items() for word in ("-p", f"{key}={value}")]
+    words = [sys.executable, "-W", "ignore", "-m", "pdkit", "nb", name, "--profile", "smoke", "--out", str(out), *pairs]
+    environment = os.environ | {"PDKIT_RENDER": "off", "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(words, cwd=cwd, env=environment, capture_output=True, text=True, timeout=280)
+    assert done.returncode == 0, done.stderr[-2000:]
+    return read_json(out / "result.json")
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_conventions(name):
+    assert nb.check_notebook(nb.find_notebook(name)) == []
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_links_and_files_that_a_notebook_names_exist(name):
+    cells = nbformat.read(nb.find_notebook(name), 4).cells
+    text = "\n".join(cell.source for cell in cells if cell.cell_type == "markdown")
+    for target in re.findall(r"\]\(([\w./-]+\.ipynb)\)", text):
+        assert (nb.NOTEBOOKS / target).exists(), target
+
+
+def test_start_here_runs_from_the_notebooks_folder(tmp_path):
+    result = run("00", tmp_path, cwd=nb.NOTEBOOKS)
+    assert result["episodes"] == result["success_once"]["n"] == 2
+    assert (tmp_path / "decorated.csv").exists()
+
+
+def test_tasks_and_demonstrations(tmp_path):
+    result = run("01", tmp_path)
+    assert result["expert_solved"] == 2 and set(result["steps_per_second"]) >= {"Door", "Pen", "StackCube"}
+    assert not any(result["pictures"].values()) and result["exercise_solved"] is False
+
+
+def test_behavior_transformer(tmp_path):
+    result = run("02", tmp_path, num_demos=2)
+    assert result["demonstrations"] == 2 and set(result["loss"]) == {"BeT", "1 bin", "window 1"}
+    assert "shipped base" in result["success_once"]
+
+
+def test_policy_decorator_trains_once_and_is_reused(tmp_path):
+    result = run("05", tmp_path, alpha=0.07)
+    assert result["env_steps"] >= 600 and result["updates"] > 0 and result["changed"]["alpha"] == [0.1, 0.07]
+    page = (tmp_path / "page.html").read_text()
+    assert "</html>" in page and "-p alpha=0.07" in page and page.count("data:image/png") == 3
+    before = (tmp_path / "training" / "policy" / "actor.safetensors").stat().st_mtime_ns
+    assert run("05", tmp_path, alpha=0.07)["success_once"] == result["success_once"]
+    assert (tmp_path / "training" / "policy" / "actor.safetensors").stat().st_mtime_ns == before
+
+
+# ---- the main job ----------------------------------------------------------------------------------------------------
+
+def test_main_job_runs_the_notebook_and_sums_up(monkeypatch, tmp_path, capsys):
+    seen = {}
+
+    def run_notebook(name, values, out):
+        seen.update(name=name, values=values, out=out)
+        return {"summary": ["base 1", "decorated 2"]}
+
+    monkeypatch.setattr(nb, "run_notebook", run_notebook)
+    assert main_job.main(["--task", "Door", "--profile", "lesson", "--seed", "3", "-p", "alpha=0.2"]) == 0
+    text = capsys.readouterr().out
+    assert seen["name"] == "05_policy_decorator" and seen["values"] == {"task": "Door", "profile": "lesson", "seed": 3, "alpha": 0.2}
+    assert "minutes on 2 cores" in text and text.rstrip().endswith("decorated 2") and str(seen["out"]) in text
+    first = seen["out"]
+    main_job.main(["--seed", "3", "-p", "alpha=0.2"])
+    assert seen["out"] == first  # the same parameters find their folder again
+    main_job.main(["--seed", "3"])
+    assert seen["out"] != first
+
+
+def test_interrupting_the_main_job_tells_how_to_go_on(monkeypatch, tmp_path, capsys):
+    def run_notebook(name, values, out):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(nb, "run_notebook", run_notebook)
+    assert main_job.main(["--out", str(tmp_path)]) == 130
+    assert "Nothing had been saved yet" in capsys.readouterr().out
+    (tmp_path / "training" / "checkpoint").mkdir(parents=True)
+    (tmp_path / "training" / "checkpoint" / "state.json").write_text('{"step": 20000}')
+    assert main_job.main(["--out", str(tmp_path), "-p", 'changes={"utd": 0.25}']) == 130
+    text = capsys.readouterr().out
+    assert "saved up to step 20,000" in text
+    assert f"""./pd run --task Door --profile lesson --seed 0 -p 'changes={{"utd": 0.25}}' --out {tmp_path}""" in text
+
+
+@pytest.mark.parametrize(("arguments", "message"), [
+    (["--task", "Dor"], "Did you mean 'Door'"), (["--profile", "fast"], "profile"), (["--seed", "x"], "seed"),
+    (["-p", "alpa=1"], "alpha"), (["-p", "alpha=2.0"], "alpha"), (["-p", "H=-5"], "H counts"), (["-p", "alpha"], "name=value"),
+    (["-p", 'changes={"utdd": 1}'], "utd"), (["-p", "seed=1", "--seed", "1"], "twice"), (["-p", "total_steps=10"], "total_steps"),
+    (["-p", "alpha=0.1", "-p", 'changes={"alpha": 0.2}'], "once"),
+])
+def test_bad_arguments_are_one_sentence_before_anything_runs(monkeypatch, arguments, message):
+    monkeypatch.setattr(nb, "run_notebook", lambda *a: pytest.fail("it ran"))
+    with pytest.raises(PdkitError, match=message) as error:
+        main_job.main(arguments)
+    assert "\n" not in str(error.value)
+
+
+def test_announced_times_follow_the_budget():
+    def minutes(profile, **values):
+        return expected_minutes(configured({"task": "Door", "profile": profile, **values}), 200)
+
+    assert minutes("smoke") < minutes("lesson") < minutes("lesson", total_steps=200_000) < minutes("paper")
+    assert 2 < minutes("lesson") < 20 and 300 < minutes("paper") < 3000
+    assert main_job.duration(5.2) == "about 5 minutes" and main_job.duration(600) == "about 10 hours"
+
+
+# ---- exercises -------------------------------------------------------------------------------------------------------
+
+def test_exercises_accept_solutions_and_name_mistakes(capsys):
+    import numpy as np
+    import torch.nn.functional as F
+
+    def focal(logits, target, gamma, power=True, mean=True):
+        log_p = F.log_softmax(logits, -1).gather(1, target[:, None])[:, 0]
+        losses = -((1 - log_p.exp()) ** (gamma if power else 0)) * log_p
+        return losses.mean() if mean else losses.sum()
+
+    def gate(residual, step, H, rng, shape=1, opposite=False):
+        p = min(step / H, 1)
+        draw = rng.random((len(residual), residual.shape[1] if shape == 2 else 1))
+        return residual * ((draw >= p) if opposite else (draw < p))
+
+    def unsolved(*_):
+        raise NotImplementedError
+
+    cases = [
+        (check.first_success, lambda s: int(np.argmax(s)) + 1 if s.any() else None, "solved"),
+        (check.first_success, lambda s: int(np.argmax(s)) if s.any() else None, "counted from 1"),
+        (check.first_success, lambda s: int(np.argmax(s)) + 1, "not None"),
+        (check.first_success, unsolved, "still to be written"),
+        (check.first_success, lambda s: 1 / 0, "ZeroDivisionError"),
+        (check.focal_loss, focal, "solved"),
+        (check.focal_loss, lambda *a: focal(*a, power=False), "factor"),
+        (check.focal_loss, lambda *a: focal(*a, mean=False), "16 times"),
+        (check.focal_loss, lambda *a: -focal(*a), "sign"),
+        (check.gate, gate, "solved"),
+        (check.gate, lambda *a: gate(*a, shape=2), "single dimensions"),
+        (check.gate, lambda *a: gate(*a, opposite=True), "chance to be ON"),
+        (check.gate, lambda r, s, H, g: r * min(s / H, 1), "scales"),
+        (check.gate, lambda r, s, H, g: r * (g.random() < s / H), "together"),
+    ]
+    for judge, answer, expected in cases:
+        assert judge(answer) == (expected == "solved")
+        assert expected in capsys.readouterr().out, (judge, expected)
+        if expected != "solved":
+            with pytest.raises(PdkitError, match=expected):
+                judge(answer, strict=True)
+
+
+def test_shipped_files_are_there():
+    """What the notebooks read: without it every lesson stops at its first cell."""
+    for name in ("Door", "StackCube"):
+        assert (DATA / "demos" / f"{name}.safetensors").is_file()
+        assert (DATA / "checkpoints" / name / "base" / "policy.json").is_file()
+        assert (DATA / "checkpoints" / name / "decorated" / "decorated.json").is_file()
