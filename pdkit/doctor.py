@@ -19,7 +19,7 @@ from importlib import metadata
 from pathlib import Path
 
 from .errors import PdkitError
-from .files import DATA, ROOT, read_json, runs_root, sha256
+from .files import DATA, ROOT, read_json, runs_root, sha256, write_json
 
 REINSTALL = "run ./pd doctor, or pip install -r environment.txt"
 TIMEOUT = 60  # seconds a probe may take; a busy machine is slow, a hung driver never ends
@@ -77,6 +77,11 @@ def check_packages(environment: Path | None = None) -> list[Check]:
         if version.split("+")[0] != pinned:  # torch's +cpu and +cu130 builds are the same version
             found.append(Check("WARN", "packages", f"{name} is {version}, tested with {pinned}", REINSTALL))
     return found or [Check("OK", "packages", f"{len(pins)} as pinned in environment.txt")]
+
+
+def data_files() -> list[Path]:
+    """The bundled files that checksums.json covers: demonstrations, checkpoints and recorded results."""
+    return sorted(p for part in ("demos", "checkpoints", "results") for p in (DATA / part).rglob("*") if p.is_file())
 
 
 def check_data() -> list[Check]:
@@ -266,12 +271,15 @@ def diagnose() -> list[Check]:
 
 
 def main(argv: list[str]) -> int:
-    """`pdkit doctor [--json]`; returns 1 when something that the main job needs does not work."""
+    """`pdkit doctor [--json] [--record-checksums]`; returns 1 when something that the main job needs does not work."""
     from .cli import Parser
 
     parser = Parser(prog="pdkit doctor", description="Check this machine; the fix stands beside each problem.")
     parser.add_argument("--json", action="store_true", help="print the checks as JSON")
+    parser.add_argument("--record-checksums", action="store_true", help="write data/checksums.json anew (after making bundled data)")
     args = parser.parse_args(argv)
+    if args.record_checksums:
+        write_json(DATA / "checksums.json", {str(path.relative_to(DATA)): sha256(path) for path in data_files()})
     checks = diagnose()
     failed = any(check.status == "FAIL" for check in checks)
     if args.json:

@@ -47,7 +47,8 @@ def duration(minutes: float) -> str:
 def command(parameters: dict[str, Any]) -> str:
     """The shell line that runs the job with these notebook parameters again."""
     named = [f"--{name} {parameters[name]}" for name in ("task", "profile", "seed") if name in parameters]
-    others = [shlex.quote(f"{name}={value}") for name, value in parameters.items() if name not in OWN_OPTIONS]
+    texts = {name: value if isinstance(value, str) else json.dumps(value) for name, value in parameters.items()}
+    others = [shlex.quote(f"{name}={text}") for name, text in texts.items() if name not in OWN_OPTIONS]
     return " ".join(["./pd run", *named, *(f"-p {other}" for other in others)])
 
 

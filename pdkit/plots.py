@@ -52,6 +52,11 @@ def styled(function: Callable[..., Picture]) -> Callable[..., Picture]:
     return wrapper
 
 
+def use_style() -> None:
+    """Give a notebook's own figures the same look."""
+    mpl.rcParams.update(STYLE)
+
+
 def blank(rows: int = 1, columns: int = 1, size: tuple[float, float] = (7.2, 4.0),
           layout: str | None = "constrained", **options) -> tuple[Picture, np.ndarray]:
     """A figure of `size` inches and its axes (rows, columns). pyplot does not know it: it never leaks or shows twice."""
@@ -252,11 +257,13 @@ def demo_figure(demos: Demos) -> Picture:
     axes[0, 1].set_title("First success")
     low, middle, high = np.quantile(demos.actions, [0.05, 0.5, 0.95], axis=0)
     x = np.arange(demos.actions.shape[1])
-    axes[0, 2].bar(x, high - low, bottom=low, width=0.75, color=COLORS["decorated"], alpha=0.6, label="5 % to 95 %")
-    axes[0, 2].plot(x, middle, "_", color="black", ms=8, label="median")
+    axes[0, 2].bar(x, high - low, bottom=low, width=0.75, color=COLORS["decorated"], alpha=0.6)
+    axes[0, 2].plot(x, middle, "_", color="black", ms=8)
     axes[0, 2].set(xlabel="action dimension", ylabel="action", ylim=(-1.05, 1.05))
-    axes[0, 2].set_title("Actions")
-    axes[0, 2].legend(fontsize=8.5, loc="best")
+    axes[0, 2].set_title("Actions: 5 % to 95 %, and the median")
+    axes[0, 2].xaxis.set_major_locator(mpl.ticker.MaxNLocator(8, integer=True))
+    for ax in axes[0, :2]:
+        ax.yaxis.set_major_locator(mpl.ticker.MaxNLocator(6, integer=True))
     return figure
 
 

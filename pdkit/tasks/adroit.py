@@ -6,7 +6,8 @@ the registered 200. The paper's Pen has 46 observations; the environment gives 4
 """
 from __future__ import annotations
 
-import logging
+import contextlib
+import io
 import os
 import sys
 import warnings
@@ -53,10 +54,10 @@ def _make(env_id: str, render: bool):
         os.environ["MUJOCO_GL"] = "egl"  # must be set before mujoco is first imported for rendering
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        logging.getLogger("gymnasium").setLevel(logging.ERROR)
         import gymnasium
-        import gymnasium_robotics
 
+        with contextlib.redirect_stderr(io.StringIO()):  # a notice about dense rewards, which the kit does not use
+            import gymnasium_robotics
         gymnasium.register_envs(gymnasium_robotics)
         height, width = RENDER_SIZE
         keywords = {"render_mode": "rgb_array", "width": width, "height": height} if render else {}
