@@ -37,15 +37,15 @@ class OnlineConfig:
 
     task: str = "Door"
     seed: int = 0
-    total_steps: int = 50_000  # primitive environment steps
+    total_steps: int = 60_000  # primitive environment steps
     num_envs: int = 8
     env_workers: int = 1  # processes that step environments while this one learns; results do not depend on it
-    warmup_steps: int = 4_000  # steps stored before learning starts
+    warmup_steps: int = 6_000  # steps stored before learning starts
     warmup: str = "base"  # actions until then: the base policy's, or base plus a gated uniform residual (the paper's code)
-    utd: float = 0.5  # gradient updates per environment step after the warm-up
+    utd: float = 0.25  # gradient updates per environment step after the warm-up
     batch: int = 256
     demo_fraction: float = 0.25  # of each batch, drawn from the demonstrations
-    n_step: int = 3
+    n_step: int = 5
     gamma: float = 0.97
     reward_shift: float = -1.0  # added to the sparse 0/1 reward of every decision
     train_limit: int = 0  # time limit of training episodes (0: the task's); shorter ones spend fewer steps on lost episodes
@@ -53,10 +53,10 @@ class OnlineConfig:
     success_tail: int = 0  # those that go on are cut, as by a time limit, this many steps after the first success; 0: not
     bootstrap: str = "truncated"  # value of s' at an episode's end: only at time limits, never, or always
     normalize_obs: bool = True  # networks see observations through the base policy's normaliser (the paper's code: raw)
-    lr_decay_from: float = 1.0  # fraction of the run after which the actor's learning rate falls linearly to a tenth
+    lr_decay_from: float = 0.5  # fraction of the run after which the actor's learning rate falls linearly to a tenth
     eval_every: int = 10_000
-    eval_episodes: int = 50  # on selection seeds
-    log_every: int = 1_000
+    eval_episodes: int = 20  # on selection seeds
+    log_every: int = 2_500
     checkpoint_every: int = 10_000
     device: str = "cpu"
     decorator: DecoratorConfig = field(default_factory=DecoratorConfig)

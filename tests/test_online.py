@@ -23,7 +23,7 @@ SMALL = SACConfig(hidden=16, layers=2, bf16=False)
 
 def config(**changes):
     values = dict(task="reach", total_steps=400, num_envs=4, env_workers=0, warmup_steps=100, batch=32, demo_fraction=0.0,
-                  eval_every=200, eval_episodes=4, log_every=100, checkpoint_every=100, normalize_obs=False, sac=SMALL,
+                  utd=0.5, n_step=3, eval_every=200, eval_episodes=4, log_every=100, checkpoint_every=100, normalize_obs=False, sac=SMALL,
                   decorator=DecoratorConfig(alpha=0.6, H=300))
     return OnlineConfig(**(values | changes))
 
@@ -203,7 +203,7 @@ def test_wrong_dimensions_and_ranges():
 
 def test_profiles_reject_unknown_names_and_wrong_types():
     assert online_config("Door", "lesson", alpha=0.2).decorator.alpha == 0.2
-    assert differences(online_config("Door", "lesson", alpha=0.25, utd=1), "lesson") == {"alpha": (0.1, 0.25), "utd": (0.5, 1.0)}
+    assert differences(online_config("Door", "lesson", alpha=0.25, utd=1), "lesson") == {"alpha": (0.1, 0.25), "utd": (0.25, 1.0)}
     for bad in (dict(alhpa=0.2), dict(alpha="0.2"), dict(num_envs=2.5), dict(alpha=2.0)):
         with pytest.raises(PdkitError):
             online_config("Door", "lesson", **bad)
@@ -216,6 +216,7 @@ def test_the_paper_profile_is_the_official_recipe():
     assert (c.sac.actor_lr, c.batch, c.utd, c.gamma, c.sac.tau, c.num_envs, c.warmup_steps) == (1e-4, 1024, 0.25, 0.97, 0.01, 16, 8000)
     assert (c.decorator.alpha, c.decorator.H, c.total_steps, c.sac.init_temperature) == (0.03, 1_000_000, 3_000_000, 1.0)
     assert (c.warmup, c.bootstrap, c.reward_shift, c.demo_fraction, c.n_step) == ("uniform", "truncated", -1.0, 0.0, 1)
+    assert (c.sac.layers, c.sac.hidden, c.sac.actor_every, c.sac.residual_penalty, c.train_limit, c.lr_decay_from) == (3, 256, 1, 0.0, 0, 1.0)
     assert (c.decorator.critic_input, c.decorator.actor_input, c.sac.critic_layer_norm, c.sac.average) == ("sum", "obs", False, 0.0)
 
 

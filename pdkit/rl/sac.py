@@ -26,11 +26,11 @@ from .networks import Actor, Critics
 class SACConfig:
     """Optimisation and networks; the defaults are the lesson profile's, the paper's are in profiles.py."""
 
-    actor_lr: float = 3e-4
-    critic_lr: float = 3e-4  # the temperature uses it too
+    actor_lr: float = 6e-4
+    critic_lr: float = 1e-3  # the temperature uses it too
     tau: float = 0.01  # step of the target critics towards the critics
     hidden: int = 256
-    layers: int = 3
+    layers: int = 2
     num_critics: int = 2
     critic_layer_norm: bool = True  # DAWN, RLPD: keeps values bounded off the data
     actor_layer_norm: bool = False
@@ -40,8 +40,8 @@ class SACConfig:
     target_entropy_scale: float = 1.0  # target entropy = -scale * act_dim
     entropy_backup: bool = True  # the entropy term inside the target
     grad_clip: float = 50.0  # global norm, separately for each critic and the actor
-    residual_penalty: float = 0.0  # weight of mean a_res^2 in the actor's loss: no drift where the critic has no preference
-    actor_every: int = 1  # critic updates per actor update
+    residual_penalty: float = 1.0  # weight of mean a_res^2 in the actor's loss: no drift where the critic has no preference
+    actor_every: int = 2  # critic updates per actor update
     average: float = 0.999  # decay of the averaged actor that evaluation uses; 0 evaluates the last weights
     bf16: bool = True  # autocast to bfloat16 where the hardware has it
 
