@@ -5,6 +5,7 @@ step now in flight, so neither the number of workers nor a restart from a checkp
 """
 from __future__ import annotations
 
+import copy
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -18,6 +19,7 @@ from .demos.format import Demos
 from .errors import PdkitError, unknown
 from .evaluate import evaluate
 from .policies import Policy
+from .rl.networks import Actor
 from .rl.replay import NStep, Replay
 from .rl.sac import SAC, SACConfig
 from .runs import Run
@@ -27,6 +29,7 @@ from .tasks.spec import TaskSpec
 from .tasks.vector import Episode, VectorEnv
 
 WARMUPS = ("base", "uniform")
+SELECTIONS = ("last", "best")
 ON_SUCCESS = ("terminate", "continue")
 BOOTSTRAPS = ("truncated", "never", "always")
 
@@ -54,8 +57,9 @@ class OnlineConfig:
     bootstrap: str = "truncated"  # value of s' at an episode's end: only at time limits, never, or always
     normalize_obs: bool = True  # networks see observations through the base policy's normaliser (the paper's code: raw)
     lr_decay_from: float = 0.5  # fraction of the run after which the actor's learning rate falls linearly to a tenth
-    eval_every: int = 10_000
-    eval_episodes: int = 20  # on selection seeds
+    eval_every: int = 5_000
+    eval_episodes: int = 30  # on selection seeds
+    select: str = "best"  # the result: the last policy, or the best evaluated one since the gate was open (mean of both success rates)
     log_every: int = 2_500
     checkpoint_every: int = 10_000
     device: str = "cpu"
@@ -63,7 +67,7 @@ class OnlineConfig:
     sac: SACConfig = field(default_factory=SACConfig)
 
     def __post_init__(self):
-        for name, known in (("warmup", WARMUPS), ("on_success", ON_SUCCESS), ("bootstrap", BOOTSTRAPS)):
+        for name, known in (("warmup", WARMUPS), ("select", SELECTIONS), ("on_success", ON_SUCCESS), ("bootstrap", BOOTSTRAPS)):
             if getattr(self, name) not in known:
                 raise unknown(name, getattr(self, name), known)
         if not 0 <= self.demo_fraction < 1 or not 0 < self.gamma <= 1 or self.n_step < 1 or self.utd < 0 or self.batch < 2:
@@ -130,6 +134,7 @@ class Trainer:
         self.step, self.train_seconds, self.rows, self.recent = 0, 0.0, [], []
         self.episode_counts = [0] * config.num_envs
         self.log: dict[str, torch.Tensor] = {}
+        self.best_score, self.best_actor = -1.0, {}  # of the evaluations so far
 
     def _next_seed(self, lane: int) -> int:
         self.episode_counts[lane] += 1
@@ -138,8 +143,18 @@ class Trainer:
     @property
     def policy(self) -> Decorated:
         """The decorated policy as it stands (the averaged actor)."""
-        return Decorated(self.base, self.agent.average if self.config.sac.average else self.agent.actor, self.config.decorator,
-                         normalize=self.config.normalize_obs)
+        return Decorated(self.base, self._actor, self.config.decorator, normalize=self.config.normalize_obs)
+
+    @property
+    def _actor(self) -> Actor:
+        return self.agent.average if self.config.sac.average else self.agent.actor
+
+    def result(self) -> Decorated:
+        """The policy that the run ends with: the last, or the one selected on the selection seeds."""
+        chosen = copy.deepcopy(self._actor)
+        if self.best_actor:
+            chosen.load_state_dict(self.best_actor)
+        return Decorated(self.base, chosen, self.config.decorator, normalize=self.config.normalize_obs)
 
     def train(self, run: Run | None = None, progress: Callable[[Trainer], None] | None = None) -> Decorated:
         """Run to `total_steps`, from a checkpoint in `run` if there is one.
@@ -166,7 +181,7 @@ class Trainer:
                 self.recent += result.episodes
                 self.train_seconds += time.monotonic() - started
                 self._report(before, envs, windows, base, run, progress)
-        return self.policy
+        return self.result()
 
     def _start(self, envs: VectorEnv, run: Run | None):
         if run is not None and run.has_checkpoint:
@@ -256,6 +271,9 @@ class Trainer:
         self.policy.reset(self.config.seed)
         table = evaluate(self.spec, self.policy.act, selection_seeds(self.config.eval_episodes), window=self.base.window, num_envs=25)
         torch.set_rng_state(state)
+        score = float(table.success_once.mean() + table.success_at_end.mean()) / 2
+        if self.config.select == "best" and self.step >= self.config.decorator.H and score >= self.best_score:
+            self.best_score, self.best_actor = score, {k: v.clone() for k, v in self._actor.state_dict().items()}
         return {"success_once": float(table.success_once.mean()), "success_at_end": float(table.success_at_end.mean()),
                 "eval_seconds": time.monotonic() - started}
 
@@ -267,7 +285,8 @@ class Trainer:
         agent = self.agent.state()
         self._must_be_finite({name: float(tensor.float().sum()) for name, tensor in agent.items()})
         arrays |= {f"agent.{k}": v.numpy() for k, v in agent.items()}
-        values = {"step": self.step, "train_seconds": self.train_seconds, "position": self.replay.position, "rows": self.rows,
+        arrays |= {f"best.{k}": v.cpu().numpy() for k, v in self.best_actor.items()}
+        values = {"step": self.step, "train_seconds": self.train_seconds, "position": self.replay.position, "rows": self.rows, "best_score": self.best_score,
                   "rng": self.rng.bit_generator.state, "recent": [vars(e) for e in self.recent],
                   "log": {k: float(v) for k, v in self.log.items()}}
         run.save_checkpoint(arrays, values)
@@ -291,4 +310,5 @@ class Trainer:
         self.step, self.train_seconds, self.rows = values["step"], values["train_seconds"], values["rows"]
         self.recent = [Episode(**e) for e in values["recent"]]
         self.log = {k: torch.tensor(v) for k, v in values["log"].items()}
+        self.best_score, self.best_actor = values["best_score"], {k: torch.from_numpy(v) for k, v in group("best").items()}
         return group("envs")

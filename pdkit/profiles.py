@@ -20,7 +20,7 @@ PROFILES = ("smoke", "lesson", "paper")
 _PAPER: dict[str, Any] = dict(
     total_steps=3_000_000, num_envs=16, warmup_steps=8_000, warmup="uniform", utd=0.25, batch=1024, demo_fraction=0.0, n_step=1,
     gamma=0.97, reward_shift=-1.0, on_success="terminate", bootstrap="truncated", normalize_obs=False, lr_decay_from=1.0,
-    eval_every=50_000, eval_episodes=50, log_every=10_000, checkpoint_every=50_000, alpha=0.2, H=2_000_000,
+    eval_every=50_000, eval_episodes=50, select="last", log_every=10_000, checkpoint_every=50_000, alpha=0.2, H=2_000_000,
     train_limit=0, success_tail=0, layers=3, actor_every=1, residual_penalty=0.0,
     actor_lr=1e-4, critic_lr=1e-4, critic_layer_norm=False, log_std_range=(-20.0, 2.0), init_temperature=1.0, average=0.0, bf16=False,
 )

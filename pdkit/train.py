@@ -109,7 +109,7 @@ def _decorated(args) -> int:
         config = online_config(args.task, args.profile, seed, **settings)
         if args.num_demos is None:
             args.num_demos = _demos_of(base_folder)
-        print(f"{args.task}, seed {seed}: " + (str(differences(config, args.profile)) or "the profile unchanged"), flush=True)
+        print(f"{args.task}, seed {seed}: " + str(differences(config, args.profile) or "the profile unchanged"), flush=True)
         out = Path(args.out or runs_root() / "train") / f"{args.task}-{args.recipe}-seed{seed}"
         row = decorate(config, base, base_demos(args), out, args.episodes)
         row |= {"recipe": args.recipe, "command": command_of(args, seed)}

@@ -161,6 +161,23 @@ def test_killed_and_resumed_gives_the_same_curve(tmp_path, stochastic):
     assert torch.equal(whole.replay.rows, resumed.replay.rows)
 
 
+def test_the_result_is_the_best_evaluated_policy_or_the_last(tmp_path):
+    for select in ("best", "last"):
+        trainer = Trainer(config(select=select, eval_every=100, decorator=DecoratorConfig(alpha=0.6, H=200)), biased_base(), spec=SPEC)
+        scores, actors = {}, {}
+
+        def note(t, scores=scores, actors=actors):
+            row = t.rows[-1]
+            scores[t.step] = (row["success_once"] + row["success_at_end"]) / 2
+            actors[t.step] = t.agent.average.head.bias.clone()
+
+        policy = trainer.train(progress=note)
+        open_gate = {step: score for step, score in scores.items() if step >= 200}
+        best = max(open_gate, key=lambda step: (open_gate[step], step))
+        assert torch.equal(policy.actor.head.bias, actors[best if select == "best" else max(actors)])
+    assert not torch.equal(actors[min(actors)], actors[max(actors)])
+
+
 def test_another_configuration_does_not_resume_a_run(tmp_path):
     Run(tmp_path, "online", flat(config()))
     with pytest.raises(PdkitError, match="differing: alpha"):
@@ -216,7 +233,8 @@ def test_the_paper_profile_is_the_official_recipe():
     assert (c.sac.actor_lr, c.batch, c.utd, c.gamma, c.sac.tau, c.num_envs, c.warmup_steps) == (1e-4, 1024, 0.25, 0.97, 0.01, 16, 8000)
     assert (c.decorator.alpha, c.decorator.H, c.total_steps, c.sac.init_temperature) == (0.03, 1_000_000, 3_000_000, 1.0)
     assert (c.warmup, c.bootstrap, c.reward_shift, c.demo_fraction, c.n_step) == ("uniform", "truncated", -1.0, 0.0, 1)
-    assert (c.sac.layers, c.sac.hidden, c.sac.actor_every, c.sac.residual_penalty, c.train_limit, c.lr_decay_from) == (3, 256, 1, 0.0, 0, 1.0)
+    assert (c.sac.layers, c.sac.hidden, c.sac.actor_every, c.sac.residual_penalty) == (3, 256, 1, 0.0)
+    assert (c.train_limit, c.success_tail, c.lr_decay_from, c.normalize_obs) == (0, 0, 1.0, False)
     assert (c.decorator.critic_input, c.decorator.actor_input, c.sac.critic_layer_norm, c.sac.average) == ("sum", "obs", False, 0.0)
 
 

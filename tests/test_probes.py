@@ -10,7 +10,8 @@ from pdkit.probes import PROBES, biased_base, zero_base
 from pdkit.rl.sac import SACConfig
 from pdkit.seeds import reported_seeds
 
-SMALL = SACConfig(hidden=32, layers=2, actor_lr=3e-3, critic_lr=3e-3, tau=0.05, average=0.95, bf16=False, init_temperature=0.01)
+SMALL = SACConfig(hidden=32, layers=2, actor_lr=3e-3, critic_lr=3e-3, tau=0.05, average=0.95, bf16=False, init_temperature=0.01,
+                  actor_every=1, residual_penalty=0.0)
 
 
 def train(name, base, decorator=None, sac=SMALL, **changes):

@@ -13,7 +13,8 @@ from pdkit.rl.sac import SAC, SACConfig
 
 def make(decorator=None, **changes):
     torch.manual_seed(0)
-    return SAC(3, 2, SACConfig(hidden=16, bf16=False, **changes), decorator or DecoratorConfig(alpha=0.3))
+    values = dict(hidden=16, bf16=False, actor_every=1, residual_penalty=0.0) | changes
+    return SAC(3, 2, SACConfig(**values), decorator or DecoratorConfig(alpha=0.3))
 
 
 def batch(count=8, discount=0.9):
@@ -95,6 +96,27 @@ def test_actor_takes_the_minimum_of_the_critics():
     assert agent.actor.mean_action(data["obs"])[:, 0].abs().max() < 0.3
 
 
+def test_the_penalty_pulls_residuals_towards_zero_and_only_as_far_as_the_critic_lets_it():
+    """Q = a_1 - penalty * mean a_res^2 over two dimensions has its top where alpha = penalty * a_res_1, at 0.3 / 0.6."""
+    agent = make(actor_lr=3e-3, autotune=False, residual_penalty=0.6)
+    agent.critics.forward = lambda x: x[None, :, 3].expand(2, -1)
+    data, g = batch(64), torch.Generator().manual_seed(0)
+    for _ in range(300):
+        agent._update_actor(data, data["obs"], 0.01 * torch.randn((64, 2), generator=g), torch.tensor(0.0))
+    residual = agent.actor.mean_action(data["obs"])
+    assert residual[:, 0].mean() == pytest.approx(0.5, abs=0.1) and residual[:, 1].abs().mean() < 0.1
+
+
+def test_the_actor_is_updated_every_so_many_critic_updates():
+    agent, data, g = make(actor_every=3), batch(), torch.Generator().manual_seed(0)
+    moved = []
+    for _ in range(6):
+        before = agent.actor.head.bias.clone()
+        agent.update(data, g)
+        moved.append(not torch.equal(before, agent.actor.head.bias))
+    assert moved == [True, False, False, True, False, False]
+
+
 def test_temperature_rises_when_entropy_is_below_target_and_falls_above():
     for scale, rises in ((-10.0, True), (10.0, False)):  # target entropy = -scale * 2
         agent, data = make(target_entropy_scale=scale, init_temperature=0.1, critic_lr=1e-2), batch()
@@ -142,9 +164,10 @@ def test_ensemble_members_are_independent():
 def test_bfloat16_learns_like_float32():
     """Equal learning, not equal numbers: a quadratic bandit solved by both to the same place."""
     for bf16 in (False, True):
-        agent = SAC(3, 2, SACConfig(hidden=64, bf16=bf16, critic_lr=1e-3, actor_lr=1e-3), DecoratorConfig(alpha=1.0, H=0))
+        settings = SACConfig(hidden=64, bf16=bf16, critic_lr=3e-3, actor_lr=3e-3, residual_penalty=0.0, average=0.95)
+        agent = SAC(3, 2, settings, DecoratorConfig(alpha=1.0, H=0))
         g = torch.Generator().manual_seed(0)
-        for _ in range(700):
+        for _ in range(400):
             action = torch.rand((128, 2), generator=g) * 2 - 1
             reward = -((action - torch.tensor([0.5, -0.25])) ** 2).sum(-1)
             zeros = torch.zeros(128, 2)

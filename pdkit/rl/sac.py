@@ -42,7 +42,7 @@ class SACConfig:
     grad_clip: float = 50.0  # global norm, separately for each critic and the actor
     residual_penalty: float = 1.0  # weight of mean a_res^2 in the actor's loss: no drift where the critic has no preference
     actor_every: int = 2  # critic updates per actor update
-    average: float = 0.999  # decay of the averaged actor that evaluation uses; 0 evaluates the last weights
+    average: float = 0.9995  # decay of the averaged actor that evaluation uses; 0 evaluates the last weights
     bf16: bool = True  # autocast to bfloat16 where the hardware has it
 
     def __post_init__(self):
