@@ -14,7 +14,7 @@ from . import nb, page
 from .cli import Parser
 from .errors import PdkitError
 from .files import read_json, runs_root
-from .online import OnlineConfig
+from .online_config import OnlineConfig
 from .plots import Picture
 from .profiles import PROFILES, online_config
 from .runs import Run

@@ -8,77 +8,25 @@ from __future__ import annotations
 import copy
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
 
 import numpy as np
 import torch
 
 from .decorated import Decorated
-from .decorator import DecoratorConfig, compose, gate, gate_probability
+from .decorator import compose, gate, gate_probability
 from .demos.format import Demos
-from .errors import PdkitError, unknown
+from .errors import PdkitError
 from .evaluate import evaluate
+from .online_config import OnlineConfig, stops
 from .policies import Policy
 from .rl.networks import Actor
 from .rl.replay import NStep, Replay
-from .rl.sac import SAC, SACConfig
+from .rl.sac import SAC
 from .runs import Run
 from .seeds import selection_seeds, training_seed
 from .tasks import get_task
 from .tasks.spec import TaskSpec
 from .tasks.vector import Episode, VectorEnv
-
-WARMUPS = ("base", "uniform")
-SELECTIONS = ("last", "best")
-ON_SUCCESS = ("terminate", "continue")
-BOOTSTRAPS = ("truncated", "never", "always")
-
-
-@dataclass(frozen=True)
-class OnlineConfig:
-    """The loop and everything in it; the profiles (profiles.py) give values for each task."""
-
-    task: str = "Door"
-    seed: int = 0
-    total_steps: int = 60_000  # primitive environment steps
-    num_envs: int = 8
-    env_workers: int = 1  # processes that step environments while this one learns; results do not depend on it
-    warmup_steps: int = 6_000  # steps stored before learning starts
-    warmup: str = "base"  # actions until then: the base policy's, or base plus a gated uniform residual (the paper's code)
-    utd: float = 0.25  # gradient updates per environment step after the warm-up
-    batch: int = 256
-    demo_fraction: float = 0.25  # of each batch, drawn from the demonstrations
-    n_step: int = 5
-    gamma: float = 0.97
-    reward_shift: float = -1.0  # added to the sparse 0/1 reward of every decision
-    train_limit: int = 0  # time limit of training episodes (0: the task's); shorter ones spend fewer steps on lost episodes
-    on_success: str = "terminate"  # training episodes end when solved, or go on
-    success_tail: int = 0  # those that go on are cut, as by a time limit, this many steps after the first success; 0: not
-    bootstrap: str = "truncated"  # value of s' at an episode's end: only at time limits, never, or always
-    normalize_obs: bool = True  # networks see observations through the base policy's normaliser (the paper's code: raw)
-    lr_decay_from: float = 0.5  # fraction of the run after which the actor's learning rate falls linearly to a tenth
-    eval_every: int = 5_000
-    eval_episodes: int = 30  # on selection seeds
-    select: str = "best"  # the result: the last policy, or the best evaluated one since the gate was open (mean of both success rates)
-    log_every: int = 2_500
-    checkpoint_every: int = 10_000
-    device: str = "cpu"
-    decorator: DecoratorConfig = field(default_factory=DecoratorConfig)
-    sac: SACConfig = field(default_factory=SACConfig)
-
-    def __post_init__(self):
-        for name, known in (("warmup", WARMUPS), ("select", SELECTIONS), ("on_success", ON_SUCCESS), ("bootstrap", BOOTSTRAPS)):
-            if getattr(self, name) not in known:
-                raise unknown(name, getattr(self, name), known)
-        if not 0 <= self.demo_fraction < 1 or not 0 < self.gamma <= 1 or self.n_step < 1 or self.utd < 0 or self.batch < 2:
-            raise PdkitError("The loop needs demo_fraction in [0, 1), gamma in (0, 1], n_step >= 1, utd >= 0 and batch >= 2.")
-        if self.total_steps <= self.warmup_steps:
-            raise PdkitError(f"total_steps ({self.total_steps}) must exceed warmup_steps ({self.warmup_steps}), or nothing is learned.")
-
-
-def stops(config: OnlineConfig, terminated: bool, truncated: bool) -> bool:
-    """Whether the value of s' is left out of the target at this transition."""
-    return {"truncated": terminated, "never": terminated or truncated, "always": False}[config.bootstrap]
 
 
 def demo_rows(demos: Demos, base: Policy, config: OnlineConfig) -> list[np.ndarray]:
@@ -286,8 +234,8 @@ class Trainer:
         self._must_be_finite({name: float(tensor.float().sum()) for name, tensor in agent.items()})
         arrays |= {f"agent.{k}": v.numpy() for k, v in agent.items()}
         arrays |= {f"best.{k}": v.cpu().numpy() for k, v in self.best_actor.items()}
-        values = {"step": self.step, "train_seconds": self.train_seconds, "position": self.replay.position, "rows": self.rows, "best_score": self.best_score,
-                  "rng": self.rng.bit_generator.state, "recent": [vars(e) for e in self.recent],
+        values = {"step": self.step, "train_seconds": self.train_seconds, "position": self.replay.position, "rows": self.rows,
+                  "best_score": self.best_score, "rng": self.rng.bit_generator.state, "recent": [vars(e) for e in self.recent],
                   "log": {k: float(v) for k, v in self.log.items()}}
         run.save_checkpoint(arrays, values)
 

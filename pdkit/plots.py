@@ -160,7 +160,7 @@ def _minutes(ax: Axes, metrics: pd.DataFrame, right: float) -> None:
 
 @styled
 def paired_figure(result: Paired, base: pd.DataFrame, other: pd.DataFrame, *,
-                  labels: tuple[str, str] = ("base", "decorated"), per_row: int = 20) -> Picture:
+                  labels: tuple[str, str] = ("base", "decorated")) -> Picture:
     """Bars with intervals, and every seed as one cell: solved by both, gained, lost, or solved by neither.
 
     `base` and `other` are the evaluate() tables that `result` compares.
@@ -171,7 +171,7 @@ def paired_figure(result: Paired, base: pd.DataFrame, other: pd.DataFrame, *,
     outcome = np.where(first & second, 0, np.where(second, 1, np.where(first, 2, 3)))
     kinds = {"both": "both solve", "gained": f"only {labels[1]}: gained", "lost": f"only {labels[0]}: lost",
              "neither": "neither"}
-    _cells(axes[0, 1], outcome, per_row, kinds)
+    _cells(axes[0, 1], outcome, kinds)
     axes[0, 1].set_title(f"The same {result.n} episodes, one cell each")
     points = f"{100 * result.difference:+.1f} points ({100 * result.low:+.1f} to {100 * result.high:+.1f})"
     axes[0, 0].set_title(points, fontsize=10)
@@ -192,9 +192,10 @@ def _rate_bars(ax: Axes, bars: Sequence[tuple[str, Rate, str]]) -> None:
     _percent(ax, "success, 95 % interval")
 
 
-def _cells(ax: Axes, values: np.ndarray, per_row: int, kinds: dict[str, str]) -> None:
+def _cells(ax: Axes, values: np.ndarray, kinds: dict[str, str]) -> None:
     """One square for each value (an index into `kinds`: colour name to label), sorted, so that areas compare."""
     colors = [COLORS[name] for name in kinds]
+    per_row = int(np.ceil(np.sqrt(2 * len(values))))  # twice as wide as high
     for i, value in enumerate(np.sort(values)):
         corner = (i % per_row + 0.06, i // per_row + 0.06)
         ax.add_patch(mpl.patches.Rectangle(corner, 0.88, 0.88, color=colors[value], lw=0))

@@ -10,7 +10,7 @@ from typing import Any
 
 from .decorator import DecoratorConfig
 from .errors import PdkitError, unknown
-from .online import OnlineConfig
+from .online_config import OnlineConfig
 from .rl.sac import SACConfig
 from .tasks import get_task
 
@@ -31,7 +31,7 @@ _PAPER_TASK: dict[str, dict[str, Any]] = {"StackCube": dict(alpha=0.03, H=1_000_
 _LESSON: dict[str, Any] = {}  # the defaults of OnlineConfig, DecoratorConfig and SACConfig
 _LESSON_TASK: dict[str, dict[str, Any]] = {
     "Door": dict(train_limit=120),
-    "StackCube": dict(alpha=0.03, H=60_000, total_steps=100_000),
+    "StackCube": dict(alpha=0.1, H=40_000, total_steps=80_000, train_limit=100, eval_every=10_000),
     "Pen": dict(total_steps=20_000, H=10_000),
 }
 _SMOKE: dict[str, Any] = dict(total_steps=600, warmup_steps=200, H=400, num_envs=4, env_workers=0, utd=0.1, batch=64, eval_every=600,

@@ -5,7 +5,6 @@ import ast
 import dataclasses
 import os
 import sys
-import time
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -17,11 +16,12 @@ from .decorated import save_decorated
 from .demos import Demos, load_demos, sources
 from .errors import PdkitError, unknown
 from .evaluate import evaluate
-from .files import DATA, atomic_file, runs_root, write_json
+from .files import DATA, atomic_file, runs_root
 from .imitate import ImitateConfig, imitate
 from .online import Trainer
 from .policies import POLICIES, Policy, load_policy, save_policy
 from .profiles import PROFILES, differences, flat, online_config
+from .recorded import record
 from .runs import Run, describe_machine
 from .seeds import reported_seeds
 from .tasks import get_task
@@ -167,18 +167,3 @@ def decorate(config, base: Policy, demos: Demos | None, out: Path, episodes: int
                load_average=round(os.getloadavg()[0], 1) if hasattr(os, "getloadavg") else None)
     run.finish(**row)
     return row
-
-
-def record(name: str, rows: pd.DataFrame, curves: pd.DataFrame) -> None:
-    """Add rows to data/results/NAME.csv and NAME_curves.csv, replacing those of the same task, recipe and seed."""
-    keys = ["task", "recipe", "seed"]
-    for path, new in ((DATA / "results" / f"{name}.csv", rows), (DATA / "results" / f"{name}_curves.csv", curves)):
-        if path.exists():
-            old = pd.read_csv(path)
-            mine = new[keys].drop_duplicates()
-            old = old.merge(mine, on=keys, how="left", indicator=True).query("_merge == 'left_only'").drop(columns="_merge")
-            new = pd.concat([old, new], ignore_index=True)
-        with atomic_file(path) as temporary:
-            new.to_csv(temporary, index=False, float_format="%.6g")
-    write_json(DATA / "results" / f"{name}_manifest.json", {"written": time.strftime("%Y-%m-%d"), "machine": describe_machine(),
-                                                           "again": sorted(set(pd.read_csv(DATA / 'results' / f'{name}.csv').command))})

@@ -10,7 +10,8 @@ from pdkit.decorated import load_decorated, save_decorated
 from pdkit.decorator import DecoratorConfig
 from pdkit.demos.format import Demos
 from pdkit.errors import PdkitError
-from pdkit.online import OnlineConfig, Trainer, demo_rows, stops
+from pdkit.online import Trainer, demo_rows
+from pdkit.online_config import OnlineConfig, stops
 from pdkit.policies import BeT
 from pdkit.probes import PROBES, biased_base
 from pdkit.profiles import differences, flat, online_config
@@ -39,10 +40,10 @@ def test_bootstrap_rules(rule, at_success, at_limit):
 
 
 def test_what_is_stored():
-    trainer = Trainer(config(n_step=1, warmup="uniform", decorator=DecoratorConfig(alpha=0.6, H=0)), biased_base(), spec=SPEC)
+    base = biased_base((0.05, 0.0))
+    trainer = Trainer(config(n_step=1, warmup="uniform", decorator=DecoratorConfig(alpha=0.6, H=0)), base, spec=SPEC)
     trainer.train()
     data = columns(trainer)
-    base = biased_base()
     assert np.allclose(data["base"], base.act(data["obs"][:, None])[:, 0])
     assert np.allclose(data["next_base"], base.act(data["next_obs"][:, None])[:, 0])
     # the successor is what the executed sum led to, final observations of ended episodes included

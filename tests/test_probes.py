@@ -5,7 +5,8 @@ import torch
 
 from pdkit.decorator import DecoratorConfig
 from pdkit.evaluate import evaluate
-from pdkit.online import OnlineConfig, Trainer
+from pdkit.online import Trainer
+from pdkit.online_config import OnlineConfig
 from pdkit.probes import PROBES, biased_base, zero_base
 from pdkit.rl.sac import SACConfig
 from pdkit.seeds import reported_seeds

@@ -1,0 +1,60 @@
+"""The configuration of the online loop, and the one rule that it decides: where the value of s' is left out."""
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from .decorator import DecoratorConfig
+from .errors import PdkitError, unknown
+from .rl.sac import SACConfig
+
+WARMUPS = ("base", "uniform")
+SELECTIONS = ("last", "best")
+ON_SUCCESS = ("terminate", "continue")
+BOOTSTRAPS = ("truncated", "never", "always")
+
+
+@dataclass(frozen=True)
+class OnlineConfig:
+    """The loop and everything in it; the profiles (profiles.py) give values for each task."""
+
+    task: str = "Door"
+    seed: int = 0
+    total_steps: int = 60_000  # primitive environment steps
+    num_envs: int = 8
+    env_workers: int = 1  # processes that step environments while this one learns; results do not depend on it
+    warmup_steps: int = 6_000  # steps stored before learning starts
+    warmup: str = "base"  # actions until then: the base policy's, or base plus a gated uniform residual (the paper's code)
+    utd: float = 0.25  # gradient updates per environment step after the warm-up
+    batch: int = 256
+    demo_fraction: float = 0.25  # of each batch, drawn from the demonstrations
+    n_step: int = 5
+    gamma: float = 0.97
+    reward_shift: float = -1.0  # added to the sparse 0/1 reward of every decision
+    train_limit: int = 0  # time limit of training episodes (0: the task's); shorter ones spend fewer steps on lost episodes
+    on_success: str = "terminate"  # training episodes end when solved, or go on
+    success_tail: int = 0  # those that go on are cut, as by a time limit, this many steps after the first success; 0: not
+    bootstrap: str = "truncated"  # value of s' at an episode's end: only at time limits, never, or always
+    normalize_obs: bool = True  # networks see observations through the base policy's normaliser (the paper's code: raw)
+    lr_decay_from: float = 0.5  # fraction of the run after which the actor's learning rate falls linearly to a tenth
+    eval_every: int = 5_000
+    eval_episodes: int = 30  # on selection seeds
+    select: str = "best"  # the result: the last policy, or the best evaluated one since the gate was open (mean of both success rates)
+    log_every: int = 2_500
+    checkpoint_every: int = 10_000
+    device: str = "cpu"
+    decorator: DecoratorConfig = field(default_factory=DecoratorConfig)
+    sac: SACConfig = field(default_factory=SACConfig)
+
+    def __post_init__(self):
+        for name, known in (("warmup", WARMUPS), ("select", SELECTIONS), ("on_success", ON_SUCCESS), ("bootstrap", BOOTSTRAPS)):
+            if getattr(self, name) not in known:
+                raise unknown(name, getattr(self, name), known)
+        if not 0 <= self.demo_fraction < 1 or not 0 < self.gamma <= 1 or self.n_step < 1 or self.utd < 0 or self.batch < 2:
+            raise PdkitError("The loop needs demo_fraction in [0, 1), gamma in (0, 1], n_step >= 1, utd >= 0 and batch >= 2.")
+        if self.total_steps <= self.warmup_steps:
+            raise PdkitError(f"total_steps ({self.total_steps}) must exceed warmup_steps ({self.warmup_steps}), or nothing is learned.")
+
+
+def stops(config: OnlineConfig, terminated: bool, truncated: bool) -> bool:
+    """Whether the value of s' is left out of the target at this transition."""
+    return {"truncated": terminated, "never": terminated or truncated, "always": False}[config.bootstrap]

@@ -1,0 +1,114 @@
+"""`pdkit train`, `pdkit demos` and the sources of demonstrations."""
+import sys
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import pdkit.demos.sources as sources
+import pdkit.recorded as recorded
+from pdkit import cli
+from pdkit.decorated import load_decorated
+from pdkit.demos import load_demos
+from pdkit.errors import PdkitError
+from pdkit.files import DATA
+from pdkit.policies import load_policy
+from pdkit.probes import ProbeBase
+from pdkit.train import parse_settings
+
+
+def call(monkeypatch, *words):
+    monkeypatch.setattr(sys, "argv", ["pdkit", *words])
+    return cli.main(list(words))
+
+
+def test_settings_are_literals_or_words():
+    assert parse_settings(["alpha=0.2", "H=3", "warmup=base", "log_std_range=(-5.0, 1.0)"]) == {
+        "alpha": 0.2, "H": 3, "warmup": "base", "log_std_range": (-5.0, 1.0)}
+    with pytest.raises(PdkitError, match="NAME=VALUE"):
+        parse_settings(["alpha"])
+
+
+def test_demonstrations_from_the_command_line(monkeypatch, tmp_path, capsys):
+    path = tmp_path / "d.safetensors"
+    assert call(monkeypatch, "demos", "StackCube", "--num", "2", "--out", str(path)) == 0
+    demos = load_demos(path)
+    assert demos.num == 2 and demos.label == "scripted" and demos.success[demos.lengths.cumsum() - 1].all()
+    assert np.array_equal(demos.actions, load_demos(DATA / "demos" / "StackCube.safetensors").first(2).actions)  # again, the same
+    assert call(monkeypatch, "demos", "--show", str(path)) == 0
+    assert "2 scripted demonstrations of StackCube" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("words", [
+    ("demos", "Stackcube"), ("demos",), ("demos", "StackCube", "--num", "0"), ("demos", "--show", "none.safetensors"),
+    ("demos", "StackCube", "--source", "human"), ("train", "base", "Door", "--policy", "gan"), ("train", "base", "Pen"),
+    ("train", "base", "Door", "--num-demos", "99"), ("train", "base", "Door", "--set", "iterrations=3"),
+    ("train", "decorated", "Door", "--set", "alpha=7.0"), ("train", "decorated", "Door", "--profile", "x"),
+    ("train", "decorated", "Door", "--base", "nowhere"),
+])
+def test_bad_input_is_one_sentence_and_exit_code_2(monkeypatch, capsys, words):
+    assert call(monkeypatch, *words) == 2
+    out, err = capsys.readouterr()
+    assert len(err.strip().splitlines()) == 1 and "Traceback" not in err
+
+
+def test_no_network_is_said_clearly(monkeypatch):
+    minari = pytest.importorskip("minari")
+
+    def offline(*args, **keywords):
+        raise ConnectionError("no route")
+
+    monkeypatch.setattr(minari, "load_dataset", offline)
+    with pytest.raises(PdkitError, match="need a network"):
+        sources.human("Door")
+
+
+def test_human_demonstrations_are_clipped_and_judged(monkeypatch):
+    """A data set as Minari gives it: raw actions beyond 1, no success recorded, the hinge at index 28."""
+    minari = pytest.importorskip("minari")
+
+    class Recorded:
+        observations = np.zeros((5, 39))
+        actions = np.full((4, 28), 1.3)
+        rewards = np.zeros(4)
+        infos: dict = {}
+
+    Recorded.observations[3:, 28] = 1.4
+
+    class Dataset:
+        def iterate_episodes(self):
+            return [Recorded]
+
+    monkeypatch.setattr(minari, "load_dataset", lambda *a, **k: Dataset())
+    demos = sources.human("Door")
+    assert demos.label == "human" and demos.actions.max() == 1.0
+    assert demos.success.tolist() == [False, False, True, True]
+
+
+def test_agent_episodes_are_what_the_simulator_did(monkeypatch):
+    from pdkit.probes import PROBES
+
+    monkeypatch.setattr(sources, "get_task", lambda name: PROBES[name])
+    base = ProbeBase(dict(obs_dim=4, act_dim=2, kind="reach", bias=[0.0, 0.0]))
+    episodes = sources.agent_episodes(base, "reach", 6, 100, 0.1, 3)
+    assert len(episodes) == 6 and all(e["success"].any() for e in episodes)
+    for e in episodes:
+        assert len(e["observations"]) == len(e["actions"]) + 1
+        assert len(e["actions"]) <= np.argmax(e["success"]) + 1 + 3
+        moved = np.clip(e["observations"][:-1, :2] + 0.2 * e["actions"], -1.5, 1.5)
+        assert np.allclose(moved, e["observations"][1:, :2], atol=1e-5)
+
+
+def test_training_from_the_command_line_records_a_row_a_seed(monkeypatch, tmp_path):
+    monkeypatch.setattr(recorded, "DATA", tmp_path)
+    monkeypatch.setenv("PDKIT_RUNS", str(tmp_path / "runs"))
+    words = ["train", "decorated", "Door", "--profile", "smoke", "--seeds", "0", "--episodes", "2", "--record", "t",
+             "--set", "eval_episodes=1"]
+    assert call(monkeypatch, *words) == 0
+    assert call(monkeypatch, *words) == 0  # finished already: the same row, not a second one
+    table = pd.read_csv(tmp_path / "results" / "t.csv")
+    assert len(table) == 1 and table.env_steps[0] >= 600 and table.command[0].startswith("pdkit train decorated Door --profile smoke")
+    assert (tmp_path / "results" / "t.png").stat().st_size > 1000
+    policy = load_decorated(tmp_path / "runs" / "train" / "Door-lesson-seed0" / "decorated")
+    base = load_policy(DATA / "checkpoints" / "Door" / "base")
+    assert policy.base.state_dict().keys() == base.state_dict().keys()
