@@ -236,7 +236,8 @@ def residual_figure(trace: pd.DataFrame, *, alpha: float, title: str = "How larg
         ax.axvline(solved.iloc[0], color=COLORS["gained"], lw=1.6)
         ax.annotate(f"solved at step {solved.iloc[0]}", (solved.iloc[0], 1), (5, -4), textcoords="offset points",
                     xycoords=("data", "axes fraction"), va="top", color=COLORS["gained"], weight="bold")
-    ax.set(xlabel="step of the episode", ylabel="size per dimension", xlim=(0, trace.step.max()), ylim=(0, None))
+    ax.set(xlabel="step of the episode", ylabel="size per dimension", xlim=(0, trace.step.max()),
+           ylim=(0, 1.2 * max(alpha, trace.base.max(), trace.residual.max())))
     ax.set_title(title)
     figure.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=8.5)
     return figure
