@@ -145,6 +145,12 @@ def configured(values: dict[str, Any]) -> OnlineConfig:
                          **values.get("changes", {}))
 
 
+def reported_episodes(values: dict[str, Any]) -> int:
+    """How many test episodes each policy gets, for the notebook's parameters."""
+    asked = values.get("eval_episodes", -1)
+    return asked if asked > 0 else (4 if values.get("profile") == "smoke" else 200)
+
+
 def _folder(values: dict[str, Any]) -> Path:
     """runs/main/TASK-PROFILE-seedN, with a short hash of the other values if any: the same ones find it again."""
     others = {name: value for name, value in sorted(values.items()) if name not in OWN_OPTIONS}
@@ -155,7 +161,7 @@ def _folder(values: dict[str, Any]) -> Path:
 def _announcement(config: OnlineConfig, values: dict[str, Any], out: Path) -> str:
     if (out / TRAINING / "manifest.json").exists() and read_json(out / TRAINING / "manifest.json").get("finished"):
         return "already trained here; only evaluated and pictured again (delete the folder to train anew)."
-    time = duration(expected_minutes(config, values.get("eval_episodes", 200)))
+    time = duration(expected_minutes(config, reported_episodes(values)))
     cores = os.cpu_count() or 1
     return f"{config.total_steps:,} environment steps, {time} on 2 cores (this machine has {cores})."
 
