@@ -27,6 +27,7 @@ class DecoratorConfig:
     H: int = 30_000  # primitive steps over which the gate opens; 0 means always open
     critic_input: str = "sum"  # sum: a_base + alpha * a_res; concat: both; residual: alpha * a_res alone
     actor_input: str = "obs"  # obs: the current observation; obs+base: with the base action
+    critic_action_scale: float = 1.0  # multiplies the actions that the critic sees: a residual of size alpha is small beside the observation
 
     def __post_init__(self):
         if not 0 < self.alpha <= 1:
@@ -52,11 +53,12 @@ def compose(config: DecoratorConfig, base, residual):
 
 def critic_features(config: DecoratorConfig, obs: torch.Tensor, base: torch.Tensor, residual: torch.Tensor) -> torch.Tensor:
     """What the critic sees, (B, critic_dim)."""
+    scale = config.critic_action_scale
     if config.critic_input == "sum":
-        return torch.cat([obs, compose(config, base, residual)], dim=-1)
+        return torch.cat([obs, scale * compose(config, base, residual)], dim=-1)
     if config.critic_input == "concat":
-        return torch.cat([obs, base, config.alpha * residual], dim=-1)
-    return torch.cat([obs, config.alpha * residual], dim=-1)
+        return torch.cat([obs, scale * base, scale * config.alpha * residual], dim=-1)
+    return torch.cat([obs, scale * config.alpha * residual], dim=-1)
 
 
 def actor_features(config: DecoratorConfig, obs: torch.Tensor, base: torch.Tensor) -> torch.Tensor:

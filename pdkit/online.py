@@ -5,6 +5,7 @@ step now in flight, so neither the number of workers nor a restart from a checkp
 """
 from __future__ import annotations
 
+import contextlib
 import copy
 import time
 from collections.abc import Callable
@@ -16,14 +17,14 @@ from .decorated import Decorated
 from .decorator import compose, gate, gate_probability
 from .demos.format import Demos
 from .errors import PdkitError
-from .evaluate import evaluate
 from .online_config import OnlineConfig, stops
+from .online_eval import Evaluations
 from .policies import Policy
 from .rl.networks import Actor
 from .rl.replay import NStep, Replay
 from .rl.sac import SAC
 from .runs import Run
-from .seeds import selection_seeds, training_seed
+from .seeds import training_seed
 from .tasks import get_task
 from .tasks.spec import TaskSpec
 from .tasks.vector import Episode, VectorEnv
@@ -57,7 +58,7 @@ class Trainer:
     """State of one online run. `train()` runs it to the end; `save` and `load` are its checkpoint."""
 
     def __init__(self, config: OnlineConfig, base: Policy, demos: Demos | None = None, spec: TaskSpec | None = None):
-        self.config, self.base = config, base.eval()
+        self.config, self.base = config, base.eval().to(config.device)
         self.spec = spec or get_task(config.task)  # a spec of its own for worlds outside the registry, such as the probes
         if base.chunk != 1:
             raise PdkitError("The online loop decorates policies that return one action at a time.")
@@ -83,6 +84,7 @@ class Trainer:
         self.episode_counts = [0] * config.num_envs
         self.log: dict[str, torch.Tensor] = {}
         self.best_score, self.best_actor = -1.0, {}  # of the evaluations so far
+        self._unscored: dict[int, dict[str, torch.Tensor]] = {}  # of a checkpoint: actors whose evaluation had not come back
 
     def _next_seed(self, lane: int) -> int:
         self.episode_counts[lane] += 1
@@ -105,7 +107,8 @@ class Trainer:
         return Decorated(self.base, chosen, self.config.decorator, normalize=self.config.normalize_obs)
 
     def train(self, run: Run | None = None, progress: Callable[[Trainer], None] | None = None) -> Decorated:
-        """Run to `total_steps`, from a checkpoint in `run` if there is one.
+        """Run to `total_steps`, from a checkpoint in `run` if there is one; `progress(self)` is called for each new row of
+        `rows`, and again when the evaluation that belongs to a row comes back.
 
         Raises PdkitError when a loss or weight stops being finite; the last checkpoint is then still good.
         """
@@ -113,8 +116,10 @@ class Trainer:
         envs = VectorEnv(self.spec, c.num_envs, self._next_seed, window=self.base.window, workers=c.env_workers,
                          terminate_on_success=c.on_success == "terminate", success_tail=c.success_tail,
                          max_episode_steps=c.train_limit or None)
-        with envs:
+        with envs, contextlib.closing(self._evaluations()) as evaluations:
             windows, base = self._start(envs, run)
+            for step, weights in self._unscored.items():
+                evaluations.submit(step, weights)
             while self.step < c.total_steps:
                 started = time.monotonic()
                 before = self.step
@@ -127,9 +132,23 @@ class Trainer:
                 windows, base = result.windows, base_next
                 self.step += int(result.steps.sum())
                 self.recent += result.episodes
+                if self._row_is_due(before):
+                    self._add_row(before, evaluations)
+                    if progress:
+                        progress(self)
+                self._collect(evaluations, progress)
                 self.train_seconds += time.monotonic() - started
-                self._report(before, envs, windows, base, run, progress)
+                if run is not None and self._crossed(before, c.checkpoint_every):
+                    self.save(run, envs.snapshot() | {"base": base}, evaluations.pending)
+            started = time.monotonic()
+            self._collect(evaluations, progress, wait=True)
+            self.train_seconds += time.monotonic() - started
         return self.result()
+
+    def _evaluations(self) -> Evaluations:
+        c = self.config
+        return Evaluations(self.spec, self.base, self._actor, c.decorator, normalize=c.normalize_obs, episodes=c.eval_episodes, seed=c.seed,
+                           workers=c.eval_workers if c.eval_every and c.eval_episodes else 0)
 
     def _start(self, envs: VectorEnv, run: Run | None):
         if run is not None and run.has_checkpoint:
@@ -180,21 +199,27 @@ class Trainer:
             self.replay.add(self.nstep.push(i, obs[i], residual[i], base[i], float(result.reward[i]) + c.reward_shift,
                                             result.final_windows[i, -1], base_final[i], stop, bool(result.done[i])))
 
-    def _report(self, before: int, envs: VectorEnv, windows, base, run: Run | None, progress) -> None:
-        c = self.config
+    def _crossed(self, before: int, every: int) -> bool:
+        """Whether a multiple of `every` steps (or the end) lies between `before` and now."""
+        return bool(every) and (self.step // every > before // every or self.step >= self.config.total_steps)
 
-        def crossed(every: int) -> bool:
-            return bool(every) and (self.step // every > before // every or self.step >= c.total_steps)
+    def _row_is_due(self, before: int) -> bool:
+        return self._crossed(before, self.config.log_every) or self._crossed(before, self.config.eval_every)
 
-        if crossed(c.log_every) or crossed(c.eval_every):
-            row = self._row()
-            if crossed(c.eval_every) and c.eval_episodes:
-                row |= self._evaluate()
-            self.rows.append(row)
+    def _add_row(self, before: int, evaluations: Evaluations) -> None:
+        self.rows.append(self._row())
+        if self._crossed(before, self.config.eval_every) and self.config.eval_episodes:
+            evaluations.submit(self.step, self._actor.state_dict())
+
+    def _collect(self, evaluations: Evaluations, progress, wait: bool = False) -> None:
+        """Enter what has been evaluated into its row, and keep the best actor since the gate was open."""
+        for step, weights, scores in evaluations.collect(wait):
+            next(row for row in self.rows if row["step"] == step).update(scores)
+            score = (scores["success_once"] + scores["success_at_end"]) / 2
+            if self.config.select == "best" and step >= self.config.decorator.H and score >= self.best_score:
+                self.best_score, self.best_actor = score, weights
             if progress:
                 progress(self)
-        if run is not None and crossed(c.checkpoint_every):
-            self.save(run, envs.snapshot() | {"base": base})
 
     def _row(self) -> dict:
         values = {name: float(value) for name, value in self.log.items()}
@@ -212,20 +237,7 @@ class Trainer:
             raise PdkitError(f"Training stopped at step {self.step}: {bad[0]} is no longer a number; the last checkpoint is good: "
                              "lower the learning rates or set bf16=False in a new run.")
 
-    def _evaluate(self) -> dict:
-        # Evaluation must not disturb the random numbers of training: a base policy may draw from torch's global generator.
-        state = torch.get_rng_state()
-        started = time.monotonic()
-        self.policy.reset(self.config.seed)
-        table = evaluate(self.spec, self.policy.act, selection_seeds(self.config.eval_episodes), window=self.base.window, num_envs=25)
-        torch.set_rng_state(state)
-        score = float(table.success_once.mean() + table.success_at_end.mean()) / 2
-        if self.config.select == "best" and self.step >= self.config.decorator.H and score >= self.best_score:
-            self.best_score, self.best_actor = score, {k: v.clone() for k, v in self._actor.state_dict().items()}
-        return {"success_once": float(table.success_once.mean()), "success_at_end": float(table.success_at_end.mean()),
-                "eval_seconds": time.monotonic() - started}
-
-    def save(self, run: Run, snapshot: dict[str, np.ndarray]) -> None:
+    def save(self, run: Run, snapshot: dict[str, np.ndarray], unscored: dict[int, dict[str, torch.Tensor]]) -> None:
         """Write a checkpoint: everything the rest of the run depends on, environments included (as seeds and actions)."""
         arrays = {f"envs.{k}": v for k, v in snapshot.items()} | {f"nstep.{k}": v for k, v in self.nstep.state().items()}
         arrays |= {"replay": self.replay.rows[: self.replay.size].cpu().numpy(), "episode_counts": np.array(self.episode_counts),
@@ -233,7 +245,8 @@ class Trainer:
         agent = self.agent.state()
         self._must_be_finite({name: float(tensor.float().sum()) for name, tensor in agent.items()})
         arrays |= {f"agent.{k}": v.numpy() for k, v in agent.items()}
-        arrays |= {f"best.{k}": v.cpu().numpy() for k, v in self.best_actor.items()}
+        arrays |= {f"best.{k}": v.numpy() for k, v in self.best_actor.items()}
+        arrays |= {f"unscored.{step}/{k}": v.numpy() for step, weights in unscored.items() for k, v in weights.items()}
         values = {"step": self.step, "train_seconds": self.train_seconds, "position": self.replay.position, "rows": self.rows,
                   "best_score": self.best_score, "rng": self.rng.bit_generator.state, "recent": [vars(e) for e in self.recent],
                   "log": {k: float(v) for k, v in self.log.items()}}
@@ -259,4 +272,7 @@ class Trainer:
         self.recent = [Episode(**e) for e in values["recent"]]
         self.log = {k: torch.tensor(v) for k, v in values["log"].items()}
         self.best_score, self.best_actor = values["best_score"], {k: torch.from_numpy(v) for k, v in group("best").items()}
+        for key, tensor in group("unscored").items():
+            step, name = key.split("/")
+            self._unscored.setdefault(int(step), {})[name] = torch.from_numpy(tensor)
         return group("envs")

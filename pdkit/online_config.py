@@ -38,6 +38,7 @@ class OnlineConfig:
     lr_decay_from: float = 0.5  # fraction of the run after which the actor's learning rate falls linearly to a tenth
     eval_every: int = 5_000
     eval_episodes: int = 30  # on selection seeds
+    eval_workers: int = 1  # 1: evaluations run in a process of their own while this one learns; results do not depend on it
     select: str = "best"  # the result: the last policy, or the best evaluated one since the gate was open (mean of both success rates)
     log_every: int = 2_500
     checkpoint_every: int = 10_000

@@ -142,11 +142,14 @@ def decorate(config, base: Policy, demos: Demos | None, out: Path, episodes: int
     run = Run(out, "decorated", flat(config))
     trainer = Trainer(config, base, demos)
 
+    shown = set()
+
     def show(t: Trainer) -> None:
-        row = t.rows[-1]
-        score = f", success {row['success_once']:.2f}, at the end {row['success_at_end']:.2f}" if "success_once" in row else ""
-        if score or row["step"] % 5000 < config.log_every:
-            print(f"  step {row['step']}, {row['updates']} updates, {row['seconds'] / 60:.1f} min{score}", flush=True)
+        for row in t.rows:
+            if "success_once" in row and row["step"] not in shown:
+                shown.add(row["step"])
+                print(f"  step {row['step']}, {row['updates']} updates, {row['seconds'] / 60:.1f} min, success {row['success_once']:.2f}, "
+                      f"at the end {row['success_at_end']:.2f}", flush=True)
 
     policy = trainer.train(run, show)
     run.write_metrics(trainer.rows)
@@ -157,8 +160,7 @@ def decorate(config, base: Policy, demos: Demos | None, out: Path, episodes: int
         tables[name] = evaluate(trainer.spec, actor.act, reported_seeds(episodes), window=base.window, num_envs=50)
         with atomic_file(out / f"{name}_episodes.csv") as temporary:
             tables[name].to_csv(temporary, index=False)
-    evaluations = sum(row.get("eval_seconds", 0.0) for row in trainer.rows)
-    row = dict(task=config.task, policy=base.kind, seed=config.seed, train_minutes=round((trainer.train_seconds + evaluations) / 60, 2),
+    row = dict(task=config.task, policy=base.kind, seed=config.seed, train_minutes=round(trainer.train_seconds / 60, 2),
                cores=describe_machine()["cores"], env_steps=trainer.step, updates=trainer.agent.updates, episodes=episodes,
                base_success=round(float(tables["base"].success_once.mean()), 4),
                base_success_at_end=round(float(tables["base"].success_at_end.mean()), 4),

@@ -23,7 +23,7 @@ SMALL = SACConfig(hidden=16, layers=2, bf16=False)
 
 
 def config(**changes):
-    values = dict(task="reach", total_steps=400, num_envs=4, env_workers=0, warmup_steps=100, batch=32, demo_fraction=0.0,
+    values = dict(task="reach", total_steps=400, num_envs=4, env_workers=0, eval_workers=0, warmup_steps=100, batch=32, demo_fraction=0.0,
                   utd=0.5, n_step=3, eval_every=200, eval_episodes=4, log_every=100, checkpoint_every=100, normalize_obs=False, sac=SMALL,
                   decorator=DecoratorConfig(alpha=0.6, H=300))
     return OnlineConfig(**(values | changes))
@@ -138,11 +138,11 @@ def bet_base():
     return base.eval()
 
 
-@pytest.mark.parametrize("stochastic", [False, True])
-def test_killed_and_resumed_gives_the_same_curve(tmp_path, stochastic):
+@pytest.mark.parametrize(("stochastic", "eval_workers"), [(False, 0), (True, 0), (True, 1)])
+def test_killed_and_resumed_gives_the_same_curve(tmp_path, stochastic, eval_workers):
     """Killed between checkpoints, resumed, against an uninterrupted run: same rows, same weights, bit for bit."""
     make = bet_base if stochastic else biased_base
-    c = config(n_step=3)
+    c = config(n_step=3, eval_workers=eval_workers)
     whole = Trainer(c, make(), spec=SPEC)
     whole.train(Run(tmp_path / "whole", "online", flat(c)))
 
@@ -160,6 +160,36 @@ def test_killed_and_resumed_gives_the_same_curve(tmp_path, stochastic):
     one, other = whole.agent.state(), resumed.agent.state()
     assert one.keys() == other.keys() and all(torch.equal(one[k], other[k]) for k in one)
     assert torch.equal(whole.replay.rows, resumed.replay.rows)
+    assert all("success_once" in row for row in whole.rows if row["step"] % 200 == 0)
+
+
+def test_where_evaluations_run_does_not_matter(tmp_path):
+    """In this process or in another, while training goes on: same rows, same policy selected."""
+    outcomes = []
+    for workers in (0, 1):
+        trainer = Trainer(config(eval_every=100, eval_workers=workers, decorator=DecoratorConfig(alpha=0.6, H=200)), bet_base(), spec=SPEC)
+        policy = trainer.train()
+        outcomes.append(([(row["step"], row["success_once"], row["success_at_end"]) for row in trainer.rows], policy.actor.state_dict()))
+    (rows, actor), (other_rows, other_actor) = outcomes
+    assert rows == other_rows and all(torch.equal(actor[k], other_actor[k]) for k in actor)
+
+
+def test_an_evaluation_that_was_not_back_at_a_checkpoint_is_made_after_resuming(tmp_path):
+    c = config(eval_every=100, checkpoint_every=100)
+    run = Run(tmp_path, "online", flat(c))
+    trainer = Trainer(c, biased_base(), spec=SPEC)
+
+    def stop_before_it_is_back(t):
+        if t.step == 200 and "success_once" not in t.rows[-1]:
+            envs = {k: v for k, v in run.load_checkpoint()[0].items() if k.startswith("envs.")}
+            t.save(run, {k.removeprefix("envs."): v for k, v in envs.items()}, {200: t._actor.state_dict()})
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        trainer.train(run, stop_before_it_is_back)
+    resumed = Trainer(c, biased_base(), spec=SPEC)
+    resumed.train(run)
+    assert all("success_once" in row for row in resumed.rows)
 
 
 def test_the_result_is_the_best_evaluated_policy_or_the_last(tmp_path):
@@ -169,6 +199,8 @@ def test_the_result_is_the_best_evaluated_policy_or_the_last(tmp_path):
 
         def note(t, scores=scores, actors=actors):
             row = t.rows[-1]
+            if "success_once" not in row:  # called once for the row and once more when it has been evaluated
+                return
             scores[t.step] = (row["success_once"] + row["success_at_end"]) / 2
             actors[t.step] = t.agent.average.head.bias.clone()
 
