@@ -20,6 +20,7 @@ from pathlib import Path
 
 from .errors import PdkitError
 from .files import DATA, ROOT, read_json, runs_root, sha256, write_json
+from .render_probe import SAPIEN_DRAWS
 
 REINSTALL = "run ./pd doctor, or pip install -r environment.txt"
 TIMEOUT = 60  # seconds a probe may take; a busy machine is slow, a hung driver never ends
@@ -193,15 +194,6 @@ renderer = mujoco.Renderer(model, 64, 64); renderer.update_scene(data)
 assert renderer.render().std() > 1, "the picture is empty"
 print("draws")
 """
-SAPIEN_FRAME = """
-import sapien
-scene = sapien.Scene(); scene.set_ambient_light([1, 1, 1])
-builder = scene.create_actor_builder(); builder.add_box_visual(half_size=[0.3] * 3)
-builder.build_kinematic().set_pose(sapien.Pose([1, 0, 0]))
-camera = scene.add_camera("camera", 64, 64, 1.0, 0.01, 10); scene.update_render(); camera.take_picture()
-assert camera.get_picture("Color").std() > 0.01, "the picture is empty"
-print("draws")
-"""
 
 
 def check_mujoco_pictures() -> list[Check]:
@@ -231,7 +223,7 @@ def check_mujoco_pictures() -> list[Check]:
 
 def check_sapien_pictures() -> list[Check]:
     """Whether SAPIEN finds a Vulkan driver that can draw. The tasks themselves run without."""
-    good, text = probe(SAPIEN_FRAME)
+    good, text = probe(SAPIEN_DRAWS)
     if good:
         return [Check("OK", "sapien vulkan", text)]
     return [Check("WARN", "sapien vulkan", f"{text}; ManiSkill tasks run, without pictures", _vulkan_fix())]

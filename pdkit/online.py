@@ -175,7 +175,7 @@ class Trainer:
         due = int((self.step - c.warmup_steps) * c.utd) - self.agent.updates
         if due > 0 and self.replay.size >= c.batch and c.lr_decay_from < 1:
             done = (self.step / c.total_steps - c.lr_decay_from) / (1 - c.lr_decay_from)
-            self.agent.set_actor_lr(1 - 0.9 * min(max(done, 0.0), 1.0))
+            self.agent.scale_lr(1 - 0.9 * min(max(done, 0.0), 1.0))
         for _ in range(max(0, due) if self.replay.size >= c.batch else 0):
             demos = round(c.batch * c.demo_fraction) if self.demos else 0
             rows = self.replay.draw(c.batch - demos, self.generator)

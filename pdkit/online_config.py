@@ -35,7 +35,7 @@ class OnlineConfig:
     success_tail: int = 0  # those that go on are cut, as by a time limit, this many steps after the first success; 0: not
     bootstrap: str = "truncated"  # value of s' at an episode's end: only at time limits, never, or always
     normalize_obs: bool = True  # networks see observations through the base policy's normaliser (the paper's code: raw)
-    lr_decay_from: float = 0.5  # fraction of the run after which the actor's learning rate falls linearly to a tenth
+    lr_decay_from: float = 0.5  # fraction of the run after which the learning rates of actor and critics fall linearly to a tenth
     eval_every: int = 5_000
     eval_episodes: int = 30  # on selection seeds
     eval_workers: int = 1  # 1: evaluations run in a process of their own while this one learns; results do not depend on it

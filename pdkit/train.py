@@ -104,6 +104,7 @@ def _decorated(args) -> int:
     settings = parse_settings(args.set)
     base_folder = Path(args.base) if args.base else DATA / "checkpoints" / args.task / "base"
     get_task(args.task)
+    base_table = None
     for seed in args.seeds:
         base = load_policy(base_folder)
         config = online_config(args.task, args.profile, seed, **settings)
@@ -111,7 +112,7 @@ def _decorated(args) -> int:
             args.num_demos = _demos_of(base_folder)
         print(f"{args.task}, seed {seed}: " + str(differences(config, args.profile) or "the profile unchanged"), flush=True)
         out = Path(args.out or runs_root() / "train") / f"{args.task}-{args.recipe}-seed{seed}"
-        row = decorate(config, base, base_demos(args), out, args.episodes)
+        row, base_table = decorate(config, base, base_demos(args), out, args.episodes, base_table)
         row |= {"recipe": args.recipe, "command": command_of(args, seed)}
         print(", ".join(f"{k} {v}" for k, v in row.items()), flush=True)
         if args.record:
@@ -137,8 +138,12 @@ def command_of(args, seed: int) -> str:
     return " ".join(parts + ([f"--record {args.record}"] if args.record else []))
 
 
-def decorate(config, base: Policy, demos: Demos | None, out: Path, episodes: int) -> dict[str, Any]:
-    """Train (or resume) one seed in `out` and evaluate base and decorated on the same test seeds: one row of evidence."""
+def decorate(config, base: Policy, demos: Demos | None, out: Path, episodes: int,
+             base_table: pd.DataFrame | None = None) -> tuple[dict[str, Any], pd.DataFrame]:
+    """Train (or resume) one seed in `out` and evaluate base and decorated on the same test seeds.
+
+    Returns one row of evidence, and the base policy's episodes: the next seed's too, so they can be passed on as `base_table`.
+    """
     run = Run(out, "decorated", flat(config))
     trainer = Trainer(config, base, demos)
 
@@ -154,10 +159,11 @@ def decorate(config, base: Policy, demos: Demos | None, out: Path, episodes: int
     policy = trainer.train(run, show)
     run.write_metrics(trainer.rows)
     save_decorated(policy, out / "decorated", {"task": config.task, "seed": config.seed})
-    tables = {}
+    tables = {} if base_table is None else {"base": base_table}
     for name, actor in (("base", base), ("decorated", policy)):
-        actor.reset(0)
-        tables[name] = evaluate(trainer.spec, actor.act, reported_seeds(episodes), window=base.window, num_envs=50)
+        if name not in tables:
+            actor.reset(0)
+            tables[name] = evaluate(trainer.spec, actor.act, reported_seeds(episodes), window=base.window, num_envs=50)
         with atomic_file(out / f"{name}_episodes.csv") as temporary:
             tables[name].to_csv(temporary, index=False)
     row = dict(task=config.task, policy=base.kind, seed=config.seed, train_minutes=round(trainer.train_seconds / 60, 2),
@@ -168,4 +174,4 @@ def decorate(config, base: Policy, demos: Demos | None, out: Path, episodes: int
                decorated_success_at_end=round(float(tables["decorated"].success_at_end.mean()), 4),
                load_average=round(os.getloadavg()[0], 1) if hasattr(os, "getloadavg") else None)
     run.finish(**row)
-    return row
+    return row, tables["base"]

@@ -137,10 +137,11 @@ class SAC:
             self.temperature_optimizer.step()
         return {"actor_loss": loss.detach(), "entropy": entropy, "temperature": temperature, "residual_abs": residual.detach().abs().mean()}
 
-    def set_actor_lr(self, factor: float) -> None:
-        """Scale the actor's learning rate (smaller late steps)."""
-        for group in self.actor_optimizer.param_groups:
-            group["lr"] = self.config.actor_lr * factor
+    def scale_lr(self, factor: float) -> None:
+        """Scale the learning rates of actor and critics (smaller late steps)."""
+        for optimizer, lr in ((self.actor_optimizer, self.config.actor_lr), (self.critic_optimizer, self.config.critic_lr)):
+            for group in optimizer.param_groups:
+                group["lr"] = lr * factor
 
     def state(self) -> dict[str, torch.Tensor]:
         """Everything that training goes on from, as named tensors."""

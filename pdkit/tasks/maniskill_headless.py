@@ -16,26 +16,9 @@ from functools import lru_cache
 from typing import Any
 
 from ..errors import PdkitError
+from ..render_probe import SAPIEN_DRAWS
 
 PICTURE = 256  # pixels a side of a rendered frame
-
-# Draws one picture on the first device that can, and prints the device's name. Run in a process of its own, because
-# SAPIEN may crash instead of raising where there is no driver.
-_PROBE = """
-import sapien
-for name in ("cuda", "cpu"):
-    try:
-        device = sapien.Device(name)
-        scene = sapien.Scene([sapien.physx.PhysxCpuSystem(), sapien.render.RenderSystem(device)])
-        camera = scene.add_camera("probe", 16, 16, 1.0, 0.1, 10.0)
-        scene.update_render()
-        camera.take_picture()
-        if camera.get_picture("Color").shape == (16, 16, 4):
-            print("DRAWS", name)
-            break
-    except RuntimeError:
-        pass
-"""
 
 
 class _Inert:
@@ -93,11 +76,11 @@ def quiet() -> Iterator[None]:
 def render_device() -> str | None:
     """The device SAPIEN can draw on, "cuda" or "cpu", or None: found once a process, by drawing in a subprocess."""
     try:
-        done = subprocess.run([sys.executable, "-c", _PROBE], capture_output=True, text=True, timeout=120)
+        done = subprocess.run([sys.executable, "-c", SAPIEN_DRAWS], capture_output=True, text=True, timeout=120)
     except subprocess.TimeoutExpired:
         return None
     words = done.stdout.split()
-    return words[-1] if done.returncode == 0 and "DRAWS" in words else None
+    return words[-1] if done.returncode == 0 and "draws" in words else None
 
 
 def require_rendering() -> str:
