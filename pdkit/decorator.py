@@ -27,7 +27,7 @@ class DecoratorConfig:
     H: int = 30_000  # primitive steps over which the gate opens; 0 means always open
     critic_input: str = "sum"  # sum: a_base + alpha * a_res; concat: both; residual: alpha * a_res alone
     actor_input: str = "obs"  # obs: the current observation; obs+base: with the base action
-    critic_action_scale: float = 1.0  # multiplies the actions that the critic sees: a residual of size alpha is small beside the observation
+    critic_action_scale: float = 1.0  # multiplies the actions that the critic sees: a residual is small beside the observation
 
     def __post_init__(self):
         if not 0 < self.alpha <= 1:

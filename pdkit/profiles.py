@@ -34,8 +34,8 @@ _LESSON_TASK: dict[str, dict[str, Any]] = {
     "StackCube": dict(alpha=0.1, H=40_000, total_steps=80_000, train_limit=100, eval_every=10_000),
     "Pen": dict(total_steps=20_000, H=10_000),
 }
-_SMOKE: dict[str, Any] = dict(total_steps=600, warmup_steps=200, H=400, num_envs=4, env_workers=0, eval_workers=0, utd=0.1, batch=64, eval_every=600,
-                              eval_episodes=2, log_every=200, checkpoint_every=300, hidden=32)
+_SMOKE: dict[str, Any] = dict(total_steps=600, warmup_steps=200, H=400, num_envs=4, env_workers=0, eval_workers=0, utd=0.1, batch=64,
+                              eval_every=600, eval_episodes=2, log_every=200, checkpoint_every=300, hidden=32)
 
 _PARTS = {"decorator": DecoratorConfig, "sac": SACConfig}
 _FIELDS = {f.name: part for part, cls in _PARTS.items() for f in dataclasses.fields(cls)}

@@ -20,11 +20,13 @@ from .files import DATA, atomic_file, runs_root
 from .imitate import ImitateConfig, imitate
 from .online import Trainer
 from .policies import POLICIES, Policy, load_policy, save_policy
+from .policies.base import read_card
 from .profiles import PROFILES, differences, flat, online_config
 from .recorded import record
 from .runs import Run, describe_machine
 from .seeds import reported_seeds
 from .tasks import get_task
+from .tensorboard import Board
 from .torch_setup import set_threads
 
 
@@ -48,6 +50,7 @@ def main(argv: list[str]) -> int:
     decorated.add_argument("--out", help="folder of the runs (default runs/train)")
     decorated.add_argument("--record", help="name under data/results: rows are added to NAME.csv and NAME_curves.csv")
     decorated.add_argument("--recipe", default="lesson", help="what to call this configuration in the record")
+    decorated.add_argument("--tensorboard", action="store_true", help="also write event files to the folder of each run")
     for one in (base, decorated):
         one.add_argument("--threads", type=int, default=1)
         one.add_argument("--set", metavar="NAME=VALUE", nargs="+", default=[], help="change a field of the configuration")
@@ -112,7 +115,9 @@ def _decorated(args) -> int:
             args.num_demos = _demos_of(base_folder)
         print(f"{args.task}, seed {seed}: " + str(differences(config, args.profile) or "the profile unchanged"), flush=True)
         out = Path(args.out or runs_root() / "train") / f"{args.task}-{args.recipe}-seed{seed}"
-        row, base_table = decorate(config, base, base_demos(args), out, args.episodes, base_table)
+        demos = base_demos(args)
+        origin = {"base": read_card(base_folder)["weights_sha256"], "demos": demos.checksum, "num_demos": demos.num}
+        row, base_table = decorate(config, base, demos, out, args.episodes, origin, base_table, args.tensorboard)
         row |= {"recipe": args.recipe, "command": command_of(args, seed)}
         print(", ".join(f"{k} {v}" for k, v in row.items()), flush=True)
         if args.record:
@@ -122,8 +127,6 @@ def _decorated(args) -> int:
 
 
 def _demos_of(folder: Path) -> int | None:
-    from .policies.base import read_card
-
     return read_card(folder)["info"].get("demos")
 
 
@@ -138,18 +141,20 @@ def command_of(args, seed: int) -> str:
     return " ".join(parts + ([f"--record {args.record}"] if args.record else []))
 
 
-def decorate(config, base: Policy, demos: Demos | None, out: Path, episodes: int,
-             base_table: pd.DataFrame | None = None) -> tuple[dict[str, Any], pd.DataFrame]:
+def decorate(config, base: Policy, demos: Demos | None, out: Path, episodes: int, origin: dict[str, Any],
+             base_table: pd.DataFrame | None = None, tensorboard: bool = False) -> tuple[dict[str, Any], pd.DataFrame]:
     """Train (or resume) one seed in `out` and evaluate base and decorated on the same test seeds.
 
+    `origin` tells which base policy and demonstrations these are; a run is resumed only with the same ones.
     Returns one row of evidence, and the base policy's episodes: the next seed's too, so they can be passed on as `base_table`.
     """
-    run = Run(out, "decorated", flat(config))
+    run = Run(out, "decorated", flat(config) | origin)
     trainer = Trainer(config, base, demos)
-
-    shown = set()
+    board, shown = Board(out) if tensorboard else None, set()
 
     def show(t: Trainer) -> None:
+        if board:
+            board.update(t.rows)
         for row in t.rows:
             if "success_once" in row and row["step"] not in shown:
                 shown.add(row["step"])
@@ -157,6 +162,8 @@ def decorate(config, base: Policy, demos: Demos | None, out: Path, episodes: int
                       f"at the end {row['success_at_end']:.2f}", flush=True)
 
     policy = trainer.train(run, show)
+    if board:
+        board.close()
     run.write_metrics(trainer.rows)
     save_decorated(policy, out / "decorated", {"task": config.task, "seed": config.seed})
     tables = {} if base_table is None else {"base": base_table}

@@ -7,13 +7,14 @@ import pytest
 
 import pdkit.demos.sources as sources
 import pdkit.recorded as recorded
-from pdkit import cli
+from pdkit import cli, train
 from pdkit.decorated import load_decorated
 from pdkit.demos import load_demos
 from pdkit.errors import PdkitError
 from pdkit.files import DATA
 from pdkit.policies import load_policy
 from pdkit.probes import ProbeBase
+from pdkit.tensorboard import Board
 from pdkit.train import parse_settings
 
 
@@ -112,3 +113,20 @@ def test_training_from_the_command_line_records_a_row_a_seed(monkeypatch, tmp_pa
     policy = load_decorated(tmp_path / "runs" / "train" / "Door-lesson-seed0" / "decorated")
     base = load_policy(DATA / "checkpoints" / "Door" / "base")
     assert policy.base.state_dict().keys() == base.state_dict().keys()
+    with pytest.raises(PdkitError, match="differing: demos, num_demos"):  # the same folder with other demonstrations is another run
+        train.main([*words[1:], "--num-demos", "2"])
+
+
+def test_tensorboard_gets_every_number_at_its_step(tmp_path):
+    event_accumulator = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
+    board = Board(tmp_path)
+    rows = [{"step": 100, "updates": 5, "seconds": 1.0, "q_mean": -2.0}, {"step": 200, "updates": 9, "seconds": 2.0, "q_mean": -1.5}]
+    board.update(rows)
+    rows[0]["success_once"] = 0.5  # an evaluation that came back late
+    board.update(rows)
+    board.close()
+    events = event_accumulator.EventAccumulator(str(tmp_path / "tensorboard"))
+    events.Reload()
+    assert sorted(events.Tags()["scalars"]) == ["q_mean", "success_once"]
+    assert [(e.step, e.value) for e in events.Scalars("q_mean")] == [(100, -2.0), (200, -1.5)]
+    assert [(e.step, e.value) for e in events.Scalars("success_once")] == [(100, 0.5)]
