@@ -24,6 +24,7 @@ class DecoratorConfig:
     """What bounds the residual and what the networks see."""
 
     alpha: float = 0.1  # bound of the residual per action dimension; the paper's range over tasks is 0.03 to 0.8
+    alpha_scale: tuple[float, ...] = ()  # factors on alpha, one an action dimension (a gripper's, say); empty: all 1
     H: int = 30_000  # primitive steps over which the gate opens; 0 means always open
     critic_input: str = "sum"  # sum: a_base + alpha * a_res; concat: both; residual: alpha * a_res alone
     actor_input: str = "obs"  # obs: the current observation; obs+base: with the base action
@@ -32,6 +33,8 @@ class DecoratorConfig:
     def __post_init__(self):
         if not 0 < self.alpha <= 1:
             raise PdkitError(f"alpha bounds the residual and must be in (0, 1], not {self.alpha}.")
+        if any(factor < 0 for factor in self.alpha_scale):
+            raise PdkitError(f"alpha_scale holds factors of 0 or more, not {self.alpha_scale}.")
         if self.H < 0:
             raise PdkitError(f"H counts environment steps and must be 0 or more, not {self.H}.")
         if self.critic_input not in CRITIC_INPUTS:
@@ -46,9 +49,22 @@ class DecoratorConfig:
         return obs_dim + act_dim * (1 if self.actor_input == "obs+base" else 0)
 
 
+def scaled(config: DecoratorConfig, residual):
+    """alpha * a_res: what is added to the base action. A tensor or an array (..., act_dim), as the residual is.
+
+    Raises PdkitError when alpha_scale does not fit the action.
+    """
+    if not config.alpha_scale:
+        return config.alpha * residual
+    if len(config.alpha_scale) != residual.shape[-1]:
+        raise PdkitError(f"alpha_scale has {len(config.alpha_scale)} factors; the action has {residual.shape[-1]} dimensions.")
+    factors = [config.alpha * factor for factor in config.alpha_scale]
+    return residual * (residual.new_tensor(factors) if isinstance(residual, torch.Tensor) else np.array(factors, residual.dtype))
+
+
 def compose(config: DecoratorConfig, base, residual):
     """The executed action, before the environment clips it. The critic sees this unclipped sum too."""
-    return base + config.alpha * residual
+    return base + scaled(config, residual)
 
 
 def critic_features(config: DecoratorConfig, obs: torch.Tensor, base: torch.Tensor, residual: torch.Tensor) -> torch.Tensor:
@@ -57,8 +73,8 @@ def critic_features(config: DecoratorConfig, obs: torch.Tensor, base: torch.Tens
     if config.critic_input == "sum":
         return torch.cat([obs, scale * compose(config, base, residual)], dim=-1)
     if config.critic_input == "concat":
-        return torch.cat([obs, scale * base, scale * config.alpha * residual], dim=-1)
-    return torch.cat([obs, scale * config.alpha * residual], dim=-1)
+        return torch.cat([obs, scale * base, scale * scaled(config, residual)], dim=-1)
+    return torch.cat([obs, scale * scaled(config, residual)], dim=-1)
 
 
 def actor_features(config: DecoratorConfig, obs: torch.Tensor, base: torch.Tensor) -> torch.Tensor:

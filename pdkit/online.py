@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from .decorated import Decorated
-from .decorator import compose, gate, gate_probability
+from .decorator import compose, gate, gate_probability, scaled
 from .demos.format import Demos
 from .errors import PdkitError
 from .online_config import OnlineConfig, stops
@@ -45,7 +45,7 @@ def demo_rows(demos: Demos, base: Policy, config: OnlineConfig) -> list[np.ndarr
         padded = np.concatenate([np.repeat(observations[:1], base.window - 1, axis=0), observations])
         windows = np.lib.stride_tricks.sliding_window_view(padded, base.window, axis=0).transpose(0, 2, 1)[: length + 1]
         bases = base.act(windows)[:, 0]
-        residuals = (actions[:length] - bases[:length]) / config.decorator.alpha
+        residuals = (actions[:length] - bases[:length]) / np.maximum(scaled(config.decorator, np.ones_like(bases[:length])), 1e-6)
         for t in range(length):
             last = t == length - 1
             terminated = last and config.on_success == "terminate" and bool(success[t])

@@ -19,7 +19,7 @@ class OnlineConfig:
 
     task: str = "Door"
     seed: int = 0
-    total_steps: int = 60_000  # primitive environment steps
+    total_steps: int = 75_000  # primitive environment steps
     num_envs: int = 8
     env_workers: int = 1  # processes that step environments while this one learns; results do not depend on it
     warmup_steps: int = 6_000  # steps stored before learning starts
@@ -31,17 +31,17 @@ class OnlineConfig:
     gamma: float = 0.97
     reward_shift: float = -1.0  # added to the sparse 0/1 reward of every decision
     train_limit: int = 0  # time limit of training episodes (0: the task's); shorter ones spend fewer steps on lost episodes
-    on_success: str = "terminate"  # training episodes end when solved, or go on
-    success_tail: int = 0  # those that go on are cut, as by a time limit, this many steps after the first success; 0: not
+    on_success: str = "continue"  # training episodes go on when solved, or end ("terminate")
+    success_tail: int = 20  # those that go on are cut, as by a time limit, this many steps after the first success; 0: not
     bootstrap: str = "truncated"  # value of s' at an episode's end: only at time limits, never, or always
     normalize_obs: bool = True  # networks see observations through the base policy's normaliser (the paper's code: raw)
-    lr_decay_from: float = 0.5  # fraction of the run after which the learning rates of actor and critics fall linearly to a tenth
-    eval_every: int = 5_000
-    eval_episodes: int = 30  # on selection seeds
+    lr_decay_from: float = 0.4  # fraction of the run after which the learning rates of actor and critics fall linearly to a tenth
+    eval_every: int = 7_500
+    eval_episodes: int = 60  # on selection seeds
     eval_workers: int = 1  # 1: evaluations run in a process of their own while this one learns; results do not depend on it
     select: str = "best"  # the result: the last policy, or the best evaluated one since the gate was open (mean of both success rates)
     log_every: int = 2_500
-    checkpoint_every: int = 10_000
+    checkpoint_every: int = 15_000
     device: str = "cpu"
     decorator: DecoratorConfig = field(default_factory=DecoratorConfig)
     sac: SACConfig = field(default_factory=SACConfig)

@@ -19,7 +19,7 @@ import numpy as np
 import pandas as pd
 
 from .decorated import Decorated
-from .decorator import compose
+from .decorator import compose, scaled
 from .errors import PdkitError
 from .files import ROOT, atomic_file
 from .plots import COLORS, Picture, blank, styled
@@ -174,7 +174,7 @@ def trace(spec: TaskSpec, policy: Decorated, seed: int, *, steps: int | None = N
 
     def watched(windows: np.ndarray) -> np.ndarray:
         base, residual = policy.parts(windows)
-        rows.append({"base": np.abs(base).mean(), "residual": policy.config.alpha * np.abs(residual).mean()})
+        rows.append({"base": np.abs(base).mean(), "residual": np.abs(scaled(policy.config, residual)).mean()})
         return compose(policy.config, base, residual)[:, None]
 
     policy.reset(0)
