@@ -19,7 +19,7 @@ class OnlineConfig:
 
     task: str = "Door"
     seed: int = 0
-    total_steps: int = 75_000  # primitive environment steps
+    total_steps: int = 65_000  # primitive environment steps
     num_envs: int = 8
     env_workers: int = 1  # processes that step environments while this one learns; results do not depend on it
     warmup_steps: int = 6_000  # steps stored before learning starts
@@ -37,7 +37,7 @@ class OnlineConfig:
     normalize_obs: bool = True  # networks see observations through the base policy's normaliser (the paper's code: raw)
     lr_decay_from: float = 0.4  # fraction of the run after which the learning rates of actor and critics fall linearly to a tenth
     eval_every: int = 7_500
-    eval_episodes: int = 60  # on selection seeds
+    eval_episodes: int = 50  # on selection seeds
     eval_workers: int = 1  # 1: evaluations run in a process of their own while this one learns; results do not depend on it
     select: str = "best"  # the result: the last policy, or the best evaluated one since the gate was open (mean of both success rates)
     log_every: int = 2_500

@@ -16,6 +16,20 @@ def test_executed_action_is_base_plus_alpha_times_residual_and_is_not_clipped():
     assert torch.allclose(action, torch.tensor([[1.1, -1.1]]))
 
 
+def test_alpha_can_differ_between_action_dimensions():
+    config = DecoratorConfig(alpha=0.1, alpha_scale=(1.0, 8.0))
+    assert torch.allclose(compose(config, BASE, RESIDUAL), torch.tensor([[0.6, -1.3]]))
+    assert np.allclose(compose(config, BASE.numpy(), RESIDUAL.numpy()), [[0.6, -1.3]])
+    assert torch.allclose(critic_features(config, OBS, BASE, RESIDUAL), torch.tensor([[1, 2, 3, 0.6, -1.3]]))
+    with pytest.raises(PdkitError, match="3 factors; the action has 2"):
+        compose(DecoratorConfig(alpha_scale=(1.0, 1.0, 1.0)), BASE, RESIDUAL)
+
+
+def test_the_critic_can_see_actions_on_another_scale():
+    config = DecoratorConfig(alpha=0.2, critic_action_scale=5.0)
+    assert torch.allclose(critic_features(config, OBS, BASE, RESIDUAL), torch.tensor([[1, 2, 3, 3.5, -3.5]]))
+
+
 @pytest.mark.parametrize(("kind", "expected"), [
     ("sum", [1, 2, 3, 0.7, -0.7]),
     ("concat", [1, 2, 3, 0.5, -0.5, 0.2, -0.2]),
@@ -56,7 +70,7 @@ def test_gate_is_drawn_per_environment_and_decision_and_stores_exact_zeros():
 
 
 @pytest.mark.parametrize("bad", [dict(alpha=0.0), dict(alpha=1.5), dict(alpha=-0.1), dict(H=-1), dict(critic_input="both"),
-                                 dict(actor_input="x")])
+                                 dict(alpha_scale=(-1.0,)), dict(actor_input="x")])
 def test_bad_values_are_told_in_one_sentence(bad):
     with pytest.raises(PdkitError) as error:
         DecoratorConfig(**bad)

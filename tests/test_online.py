@@ -24,8 +24,8 @@ SMALL = SACConfig(hidden=16, layers=2, bf16=False)
 
 def config(**changes):
     values = dict(task="reach", total_steps=400, num_envs=4, env_workers=0, eval_workers=0, warmup_steps=100, batch=32, demo_fraction=0.0,
-                  utd=0.5, n_step=3, eval_every=200, eval_episodes=4, log_every=100, checkpoint_every=100, normalize_obs=False, sac=SMALL,
-                  decorator=DecoratorConfig(alpha=0.6, H=300))
+                  utd=0.5, n_step=3, on_success="terminate", success_tail=0, eval_every=200, eval_episodes=4, log_every=100,
+                  checkpoint_every=100, normalize_obs=False, sac=SMALL, decorator=DecoratorConfig(alpha=0.6, H=300))
     return OnlineConfig(**(values | changes))
 
 
@@ -190,6 +190,14 @@ def test_an_evaluation_that_was_not_back_at_a_checkpoint_is_made_after_resuming(
     resumed = Trainer(c, biased_base(), spec=SPEC)
     resumed.train(run)
     assert all("success_once" in row for row in resumed.rows)
+
+
+def test_learning_rates_of_actor_and_critics_fall_to_a_tenth():
+    trainer = Trainer(config(lr_decay_from=0.5, eval_every=0), biased_base(), spec=SPEC)
+    seen = []
+    trainer.train(progress=lambda t: seen.append([o.param_groups[0]["lr"] for o in (t.agent.actor_optimizer, t.agent.critic_optimizer)]))
+    assert seen[1] == [SMALL.actor_lr, SMALL.critic_lr]  # at half of the run
+    assert np.allclose(seen[-1], [0.1 * SMALL.actor_lr, 0.1 * SMALL.critic_lr], rtol=0.1)
 
 
 def test_the_result_is_the_best_evaluated_policy_or_the_last(tmp_path):

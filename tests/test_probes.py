@@ -17,7 +17,8 @@ SMALL = SACConfig(hidden=32, layers=2, actor_lr=3e-3, critic_lr=3e-3, tau=0.05, 
 
 def train(name, base, decorator=None, sac=SMALL, **changes):
     values = dict(task=name, total_steps=2000, num_envs=4, env_workers=0, warmup_steps=200, warmup="uniform", utd=0.5, batch=64,
-                  demo_fraction=0.0, n_step=1, gamma=0.9, eval_every=0, log_every=0, checkpoint_every=0, normalize_obs=False)
+                  demo_fraction=0.0, n_step=1, on_success="terminate", success_tail=0, gamma=0.9, eval_every=0, log_every=0,
+                  checkpoint_every=0, normalize_obs=False)
     config = OnlineConfig(**(values | changes), sac=sac, decorator=decorator or DecoratorConfig(alpha=1.0, H=0))
     trainer = Trainer(config, base, spec=PROBES[name])
     return trainer, trainer.train()
