@@ -23,6 +23,8 @@ def evaluate(spec: TaskSpec, actor: Actor, seeds: Sequence[int], *, window: int 
     """
     if not len(seeds):
         raise PdkitError("An evaluation needs at least one episode.")
+    if len(set(seeds)) < len(seeds):
+        raise PdkitError("An evaluation needs seeds that differ: each stands for one episode.")
     queue = list(seeds)[::-1]
     num_envs = min(num_envs, len(queue))
     rows: dict[int, dict] = {}

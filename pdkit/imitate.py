@@ -32,6 +32,10 @@ class ImitateConfig:
     seed: int = 0
     bf16: bool = True  # autocast to bfloat16 where the CPU or GPU has it
 
+    def __post_init__(self):
+        if self.iterations < 1 or self.batch < 1 or self.eval_every < 1 or self.eval_episodes < 0 or self.lr <= 0 or self.seed < 0:
+            raise PdkitError("Imitation needs iterations, batch and eval_every >= 1, eval_episodes and seed >= 0 and lr > 0.")
+
 
 class Windows:
     """All training windows of a demonstration set: (window, obs_dim) observations with the action taken at each position."""

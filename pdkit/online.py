@@ -28,6 +28,7 @@ from .seeds import training_seed
 from .tasks import get_task
 from .tasks.spec import TaskSpec
 from .tasks.vector import Episode, VectorEnv
+from .torch_setup import pick_device
 
 
 def demo_rows(demos: Demos, base: Policy, config: OnlineConfig) -> list[np.ndarray]:
@@ -58,6 +59,7 @@ class Trainer:
     """State of one online run. `train()` runs it to the end; `save` and `load` are its checkpoint."""
 
     def __init__(self, config: OnlineConfig, base: Policy, demos: Demos | None = None, spec: TaskSpec | None = None):
+        pick_device(config.device)  # an error where it is not there
         self.config, self.base = config, base.eval().to(config.device)
         self.spec = spec or get_task(config.task)  # a spec of its own for worlds outside the registry, such as the probes
         if base.chunk != 1:
@@ -118,7 +120,7 @@ class Trainer:
                          max_episode_steps=c.train_limit or None)
         with envs, contextlib.closing(self._evaluations()) as evaluations:
             windows, base = self._start(envs, run)
-            for step, weights in self._unscored.items():
+            for step, weights in sorted(self._unscored.items()):
                 evaluations.submit(step, weights)
             while self.step < c.total_steps:
                 started = time.monotonic()

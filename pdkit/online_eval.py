@@ -23,6 +23,7 @@ from .tasks.spec import TaskSpec
 from .torch_setup import set_threads
 
 LANES = 25  # episodes side by side in one evaluation
+DIED = "The process that evaluates died; run `pdkit doctor`, or set eval_workers=0 to see its error."
 State = dict[str, torch.Tensor]
 
 
@@ -73,14 +74,17 @@ class Evaluations:
     def _feed(self) -> None:
         # One at a time, and only to an idle process: a larger message would block until the one before is done.
         if self._process is not None and self.pending and not self._busy:
-            self._pipe.send({name: tensor.numpy() for name, tensor in next(iter(self.pending.values())).items()})
+            try:
+                self._pipe.send({name: tensor.numpy() for name, tensor in next(iter(self.pending.values())).items()})
+            except OSError:
+                raise PdkitError(DIED) from None
             self._busy = True
 
     def _receive(self) -> dict[str, float]:
         try:
             answer = self._pipe.recv()
         except (EOFError, ConnectionResetError):
-            answer = PdkitError("The process that evaluates died; run `pdkit doctor`, or set eval_workers=0 to see its error.")
+            answer = PdkitError(DIED)
         self._busy = False
         if isinstance(answer, BaseException):
             raise answer

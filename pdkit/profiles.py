@@ -54,25 +54,27 @@ def profile_values(task: str, profile: str) -> dict[str, Any]:
     return {"paper": _PAPER | _PAPER_TASK.get(task, {}), "lesson": lesson, "smoke": lesson | _SMOKE}[profile]
 
 
-def online_config(task: str, profile: str = "lesson", seed: int = 0, **changes: Any) -> OnlineConfig:
+def online_config(task: str, profile: str = "lesson", seed: int = 0, /, **changes: Any) -> OnlineConfig:
     """The configuration of an online run: the profile's values with `changes` (flat names, such as alpha, H, utd, critic_lr).
 
     Raises PdkitError for an unknown name, or a value whose type or range is wrong.
     """
     values = profile_values(task, profile)
+    known = (_LOOP | set(_FIELDS)) - {"task", "seed"}  # these two have arguments of their own
     for name in changes:
-        if name not in _LOOP | set(_FIELDS):
-            raise unknown("parameter", name, _LOOP | set(_FIELDS))
+        if name not in known:
+            raise unknown("parameter", name, known)
     return build(OnlineConfig, {"task": task, "seed": seed} | values | changes)
 
 
 def build(cls: type, values: dict[str, Any]) -> OnlineConfig:
     """An OnlineConfig from flat values, its parts filled from the same dict, types checked."""
-    parts = {part: _checked(kind, {k: v for k, v in values.items() if _FIELDS.get(k) == part}) for part, kind in _PARTS.items()}
-    return _checked(cls, {k: v for k, v in values.items() if k in _LOOP}, **parts)
+    parts = {part: checked(kind, {k: v for k, v in values.items() if _FIELDS.get(k) == part}) for part, kind in _PARTS.items()}
+    return checked(cls, {k: v for k, v in values.items() if k in _LOOP}, **parts)
 
 
-def _checked(cls: type, values: dict[str, Any], **parts: Any):
+def checked(cls: type, values: dict[str, Any], **parts: Any) -> Any:
+    """A `cls` (a dataclass with defaults) from `values`, each of its field's type. Raises PdkitError when one is not."""
     defaults = {f.name: f.default for f in dataclasses.fields(cls)}
     checked = {}
     for name, value in values.items():
@@ -83,6 +85,8 @@ def _checked(cls: type, values: dict[str, Any], **parts: Any):
             value = tuple(value)
         if type(value) is not type(default):
             raise PdkitError(f"{name} must be of type {type(default).__name__}, as {default!r} is, not {value!r}.")
+        if isinstance(value, tuple) and not (all(isinstance(v, int | float) for v in value) and len(value) == (len(default) or len(value))):
+            raise PdkitError(f"{name} must hold {len(default) or 'only'} numbers, not {value!r}.")
         checked[name] = value
     return cls(**checked, **parts)
 

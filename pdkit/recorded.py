@@ -31,7 +31,7 @@ def record(name: str, rows: pd.DataFrame, curves: pd.DataFrame) -> None:
         write_json(folder / f"{name}_manifest.json", {"written": time.strftime("%Y-%m-%d"), "machine": describe_machine(),
                                                      "again": sorted(set(tables[0].command))})
         with atomic_file(folder / f"{name}.png") as temporary:
-            figure(*tables).savefig(temporary, dpi=130)
+            figure(*tables, "Door" if "Door" in set(tables[0].task) else str(rows.task.iloc[0])).savefig(temporary, dpi=130)
 
 
 @contextlib.contextmanager
@@ -61,7 +61,7 @@ def figure(table: pd.DataFrame, curves: pd.DataFrame, task: str = "Door") -> Fig
     several = table.recipe.nunique() > 1
     fig, (left, right) = plt.subplots(1, 2, figsize=(10, 4.4 if several else 3.6), width_ratios=(3, 2), layout="constrained")
     colors = plt.get_cmap("tab20" if several else "tab10")
-    bars = [("base", table.base_success.iloc[0], "0.65")]
+    bars = [("base", table.base_success.iloc[0], "0.65")]  # the first row's; a recipe with another base policy is named so
     for i, row in enumerate(table.itertuples()):
         name, color = (f"{row.recipe}, seed {row.seed}" if several else f"seed {row.seed}"), colors(i % colors.N)
         curve = curves[(curves.recipe == row.recipe) & (curves.seed == row.seed)].dropna(subset=["success_once"])

@@ -18,6 +18,8 @@ from .files import ROOT, atomic_file, atomic_folder, read_json, sha256, write_js
 
 PACKAGES = ("torch", "numpy", "gymnasium", "gymnasium-robotics", "mujoco", "mani-skill", "sapien")
 
+NO_MATTER = {"env_workers", "eval_workers"}  # parameters on which results do not depend: a run may go on with others
+
 
 def _git() -> str:
     try:
@@ -63,7 +65,7 @@ class Run:
 
         asked = json.loads(json.dumps(parameters))
         old = self.manifest.get("parameters", {})
-        differing = sorted(k for k in asked.keys() | old.keys() if asked.get(k) != old.get(k))
+        differing = sorted(k for k in (asked.keys() | old.keys()) - NO_MATTER if asked.get(k) != old.get(k))
         if self.manifest.get("kind") != kind or differing:
             raise PdkitError(f"{self.folder} holds another run (differing: {', '.join(differing) or 'kind'}); choose another folder or "
                              "delete this one.")

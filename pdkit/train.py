@@ -21,7 +21,7 @@ from .imitate import ImitateConfig, imitate
 from .online import Trainer
 from .policies import POLICIES, Policy, load_policy, save_policy
 from .policies.base import read_card
-from .profiles import PROFILES, differences, flat, online_config
+from .profiles import PROFILES, checked, differences, flat, online_config
 from .recorded import record
 from .runs import Run, describe_machine
 from .seeds import reported_seeds
@@ -53,7 +53,7 @@ def main(argv: list[str]) -> int:
     decorated.add_argument("--tensorboard", action="store_true", help="also write event files to the folder of each run")
     for one in (base, decorated):
         one.add_argument("--threads", type=int, default=1)
-        one.add_argument("--set", metavar="NAME=VALUE", nargs="+", default=[], help="change a field of the configuration")
+        one.add_argument("--set", metavar="NAME=VALUE", nargs="+", action="extend", default=[], help="change a field of the configuration")
     args = parser.parse_args(argv)
     set_threads(args.threads)
     return (_base if args.kind == "base" else _decorated)(args)
@@ -90,7 +90,7 @@ def _base(args) -> int:
     for name in settings:
         if name not in fields | set(architecture):
             raise unknown("field", name, fields | set(POLICIES[args.policy].defaults))
-    config = ImitateConfig(**{k: v for k, v in settings.items() if k in fields})
+    config = checked(ImitateConfig, {k: v for k, v in settings.items() if k in fields})
     out = Path(args.out) if args.out else runs_root() / "base" / f"{args.task}-{args.policy}"
     print(f"{args.policy} on {demos.num} demonstrations of {args.task} ({demos.label}): {config}", flush=True)
     policy, history = imitate(args.policy, demos, config, architecture,
@@ -108,6 +108,8 @@ def _decorated(args) -> int:
     base_folder = Path(args.base) if args.base else DATA / "checkpoints" / args.task / "base"
     get_task(args.task)
     base_table = None
+    if args.episodes < 1 or min(args.seeds) < 0:
+        raise PdkitError("--episodes must be at least 1 and every seed 0 or more.")
     for seed in args.seeds:
         base = load_policy(base_folder)
         config = online_config(args.task, args.profile, seed, **settings)
@@ -115,8 +117,9 @@ def _decorated(args) -> int:
             args.num_demos = _demos_of(base_folder)
         print(f"{args.task}, seed {seed}: " + str(differences(config, args.profile) or "the profile unchanged"), flush=True)
         out = Path(args.out or runs_root() / "train") / f"{args.task}-{args.recipe}-seed{seed}"
-        demos = base_demos(args)
-        origin = {"base": read_card(base_folder)["weights_sha256"], "demos": demos.checksum, "num_demos": demos.num}
+        demos = base_demos(args) if config.demo_fraction else None
+        origin = {"base": read_card(base_folder)["weights_sha256"], "demos": demos.checksum if demos else None,
+                  "num_demos": demos.num if demos else 0}
         row, base_table = decorate(config, base, demos, out, args.episodes, origin, base_table, args.tensorboard)
         row |= {"recipe": args.recipe, "command": command_of(args, seed)}
         print(", ".join(f"{k} {v}" for k, v in row.items()), flush=True)

@@ -89,6 +89,57 @@ def test_the_gate_is_applied_while_training_and_not_in_evaluation():
     assert np.array_equal(fresh.act(windows), fresh.act(windows))
 
 
+def test_the_gate_holds_for_learned_residuals_and_what_is_stored_is_what_was_executed():
+    c = config(n_step=1, total_steps=2000, eval_every=0, decorator=DecoratorConfig(alpha=0.6, H=3000), on_success="continue")
+    trainer = Trainer(c, biased_base(), spec=SPEC)
+    trainer.train()
+    rows = {k: v[1000:] for k, v in columns(trainer).items()}  # long after the warm-up; the gate is between 1/3 and 2/3 open
+    closed = (rows["residual"] == 0).all(axis=1)
+    assert 0.35 < closed.mean() < 0.65
+    executed = np.clip(rows["base"] + 0.6 * rows["residual"], -1, 1)
+    assert np.allclose(rows["next_obs"][:, :2], np.clip(rows["obs"][:, :2] + 0.2 * executed, -1.5, 1.5), atol=1e-5)
+
+
+def test_actor_and_learner_see_observations_through_the_base_policys_normaliser():
+    base = biased_base()
+    base.normalizer.mean.fill_(0.5)
+    base.normalizer.std.fill_(2.0)
+    observations = np.random.default_rng(0).normal(size=(5, 4)).astype(np.float32)
+    for normalize in (True, False):
+        trainer = Trainer(config(normalize_obs=normalize), base, spec=SPEC)
+        trainer.agent.average.head.weight.data.normal_()
+        expected = torch.from_numpy((observations - 0.5) / 2 if normalize else observations)
+        with torch.no_grad():
+            residual = trainer.agent.average.mean_action(expected).numpy()
+        assert np.allclose(trainer.policy.parts(observations[:, None])[1], residual, atol=1e-6)
+        acted = trainer.agent.act(torch.from_numpy(observations), torch.zeros(5, 2))
+        assert np.allclose(acted.numpy(), residual, atol=1e-6)
+
+
+def test_training_episodes_keep_their_own_time_limit_and_tail():
+    seen = []
+    trainer = Trainer(config(train_limit=7, eval_every=0), biased_base(), spec=SPEC)
+    trainer.train(progress=lambda t: seen.append(t.rows[-1].get("train_length")))
+    assert max(x for x in seen if x) <= 7
+    base = biased_base((0.0, 0.0))
+    lengths = {}
+    for tail in (0, 2):
+        trainer = Trainer(config(on_success="continue", success_tail=tail, eval_every=0, log_every=400, utd=0.0), base, spec=SPEC)
+        trainer.train()
+        lengths[tail] = trainer.rows[-1]["train_length"]
+    assert lengths[2] < lengths[0]
+
+
+def test_a_dead_evaluator_is_told_in_one_sentence():
+    trainer = Trainer(config(eval_workers=1), biased_base(), spec=SPEC)
+    evaluations = trainer._evaluations()
+    evaluations._process.terminate()
+    evaluations._process.join()
+    with pytest.raises(PdkitError, match="eval_workers=0"):
+        evaluations.submit(1, trainer._actor.state_dict())
+        list(evaluations.collect(wait=True))
+
+
 def test_the_base_policy_runs_once_for_each_window():
     base = biased_base()
     seen = []
@@ -114,6 +165,18 @@ def test_demo_rows_execute_the_demonstrated_action():
         assert (rows["discount"] == 0).tolist() == [False] * (length - 1) + [rule == "terminate"]
 
 
+def test_demo_rows_show_the_base_policy_the_windows_that_it_would_see_when_acting():
+    rng = np.random.default_rng(0)
+    observations, actions = rng.normal(size=(7, 4)).astype(np.float32), rng.uniform(-1, 1, (6, 2)).astype(np.float32)
+    demos = Demos("reach", "scripted", "", "", observations, actions, np.arange(6) == 5, np.array([6]), np.array([0]))
+    base, replay = bet_base(act_dropout=False), Trainer(config(), biased_base(), spec=SPEC).replay
+    rows = replay.unpack(torch.from_numpy(np.stack(demo_rows(demos, base, config(n_step=1)))))
+    history = [observations[0]] * base.window  # an episode starts with its first observation repeated
+    for t in range(6):
+        history = history[1:] + [observations[t]]
+        assert np.allclose(rows["base"][t], base.act(np.stack(history)[None])[0, 0], atol=1e-5)
+
+
 def test_a_batch_mixes_in_the_asked_fraction_of_demonstrations():
     rng = np.random.default_rng(0)
     demos = Demos("reach", "scripted", "", "", rng.normal(size=(41, 4)).astype(np.float32), rng.uniform(-1, 1, (40, 2)).astype(np.float32),
@@ -130,9 +193,9 @@ def test_a_batch_mixes_in_the_asked_fraction_of_demonstrations():
         Trainer(config(demo_fraction=0.25), biased_base(), spec=SPEC)
 
 
-def bet_base():
+def bet_base(act_dropout=True):
     torch.manual_seed(0)
-    base = BeT(dict(obs_dim=4, act_dim=2, window=3, bins=2, layers=1, heads=2, embed=16, features=16, act_dropout=True))
+    base = BeT(dict(obs_dim=4, act_dim=2, window=3, bins=2, layers=1, heads=2, embed=16, features=16, act_dropout=act_dropout))
     rng = np.random.default_rng(0)
     base.fit_statistics(rng.normal(size=(50, 4)).astype(np.float32), rng.uniform(-1, 1, (50, 2)).astype(np.float32))
     return base.eval()
@@ -197,7 +260,7 @@ def test_learning_rates_of_actor_and_critics_fall_to_a_tenth():
     seen = []
     trainer.train(progress=lambda t: seen.append([o.param_groups[0]["lr"] for o in (t.agent.actor_optimizer, t.agent.critic_optimizer)]))
     assert seen[1] == [SMALL.actor_lr, SMALL.critic_lr]  # at half of the run
-    assert np.allclose(seen[-1], [0.1 * SMALL.actor_lr, 0.1 * SMALL.critic_lr], rtol=0.1)
+    assert np.allclose(seen[-1], [0.1 * SMALL.actor_lr, 0.1 * SMALL.critic_lr], rtol=0.25)
 
 
 def test_the_result_is_the_best_evaluated_policy_or_the_last(tmp_path):

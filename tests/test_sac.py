@@ -85,6 +85,20 @@ def test_actor_climbs_the_critic_through_the_residual_alone():
     assert residual[:, 1].abs().mean() < 0.5
 
 
+def test_actor_loss_against_numbers_computed_by_hand():
+    agent, data = make(residual_penalty=0.3), batch()
+    noise, temperature = torch.randn(8, 2), torch.tensor(0.5)
+    with torch.no_grad():
+        residual, log_pi = agent.actor.sample(data["obs"], noise)
+        value = agent.critics(torch.cat([data["obs"], data["base"] + 0.3 * residual], -1)).min(0).values
+        expected = (0.5 * log_pi - value).mean() + 0.3 * residual.square().mean()
+    assert torch.allclose(agent._update_actor(data, data["obs"], noise, temperature)["actor_loss"], expected, atol=1e-5)
+
+
+def test_target_entropy_is_minus_the_number_of_action_dimensions():
+    assert make().target_entropy == -2 and make(target_entropy_scale=0.5).target_entropy == -1
+
+
 def test_actor_takes_the_minimum_of_the_critics():
     agent = make(actor_lr=3e-3, autotune=False)
     # The minimum of a and -a/2 is highest at a = 0; following only the first critic (or their mean or maximum) runs to +1.

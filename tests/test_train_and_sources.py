@@ -45,6 +45,10 @@ def test_demonstrations_from_the_command_line(monkeypatch, tmp_path, capsys):
     ("demos", "StackCube", "--source", "human"), ("train", "base", "Door", "--policy", "gan"), ("train", "base", "Pen"),
     ("train", "base", "Door", "--num-demos", "99"), ("train", "base", "Door", "--set", "iterrations=3"),
     ("train", "decorated", "Door", "--set", "alpha=7.0"), ("train", "decorated", "Door", "--profile", "x"),
+    ("train", "decorated", "Door", "--set", "seed=3"), ("train", "decorated", "Door", "--seeds", "-1"),
+    ("train", "decorated", "Door", "--episodes", "0"), ("train", "decorated", "Door", "--set", "device=gpu"),
+    ("train", "decorated", "Door", "--set", "log_std_range=(1.0,)"), ("train", "base", "Door", "--set", "eval_every=0"),
+    ("train", "base", "Door", "--set", "lr=fast"), ("train", "decorated", "Door", "--set", "batch=100000"),
     ("train", "decorated", "Door", "--base", "nowhere"),
 ])
 def test_bad_input_is_one_sentence_and_exit_code_2(monkeypatch, capsys, words):
@@ -115,6 +119,14 @@ def test_training_from_the_command_line_records_a_row_a_seed(monkeypatch, tmp_pa
     assert policy.base.state_dict().keys() == base.state_dict().keys()
     with pytest.raises(PdkitError, match="differing: demos, num_demos"):  # the same folder with other demonstrations is another run
         train.main([*words[1:], "--num-demos", "2"])
+
+
+def test_a_record_of_another_task_alone_can_be_drawn(monkeypatch, tmp_path):
+    monkeypatch.setattr(recorded, "DATA", tmp_path)
+    row = dict(task="StackCube", recipe="lesson", seed=0, episodes=10, base_success=0.5, decorated_success=0.9, command="x")
+    curve = dict(task="StackCube", recipe="lesson", seed=0, step=[10, 20], success_once=[0.5, 0.9])
+    recorded.record("s", pd.DataFrame([row]), pd.DataFrame(curve))
+    assert (tmp_path / "results" / "s.png").stat().st_size > 1000
 
 
 def test_tensorboard_gets_every_number_at_its_step(tmp_path):

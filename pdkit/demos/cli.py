@@ -42,7 +42,10 @@ def main(argv: list[str]) -> int:
     get_task(args.task)
     source = args.source or ("scripted" if args.task in EXPERTS else "agent")
     out = Path(args.out) if args.out else runs_root() / "demos" / f"{args.task}-{source}-{args.num}.safetensors"
-    out.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)  # before the work, not after
+    except OSError as error:
+        raise PdkitError(f"Cannot write to {out.parent}: {error.strerror}; choose another --out.") from None
     demos = _make(args, source)
     save_demos(demos, out)
     describe(demos, out)

@@ -37,7 +37,7 @@ class Policy(nn.Module):
     """A policy over a window of observations: (N, window, obs_dim) -> an action chunk (N, chunk, act_dim) in [-1, 1].
 
     The window is kept by the vectorised environment, so a policy holds no state per episode; `reset(seed)` restarts
-    its own random numbers (dropout, sampling). The one policy with memory, BC-RNN, reads the window afresh.
+    its own random numbers (dropout, sampling).
     """
 
     kind = ""  # its name in POLICIES
@@ -73,7 +73,7 @@ class Policy(nn.Module):
     def act(self, windows: np.ndarray) -> np.ndarray:
         """The same with numpy arrays and the actions clipped to [-1, 1]: what every loop calls."""
         device = next(self.parameters()).device
-        actions = self(torch.from_numpy(np.ascontiguousarray(windows, np.float32)).to(device))
+        actions = self(torch.from_numpy(np.require(windows, np.float32, ["C", "W"])).to(device))
         return actions.clamp(-1, 1).float().cpu().numpy()
 
 

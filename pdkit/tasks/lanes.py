@@ -11,6 +11,7 @@ from ..errors import PdkitError
 from .spec import TaskSpec
 
 IDLE = -1  # instead of a seed: this lane has nothing more to do
+DIED = "A simulator process died; run `pdkit doctor`, or set env_workers=0 to see its error."
 
 
 class _Lane:
@@ -143,7 +144,7 @@ class Workers:
             answer = pipe.recv()
         except (EOFError, ConnectionResetError):
             self.close()
-            raise PdkitError("A simulator process died; run `pdkit doctor`, or set env_workers=0 to see its error.") from None
+            raise PdkitError(DIED) from None
         if isinstance(answer, BaseException):
             self.close()
             raise answer
@@ -151,7 +152,14 @@ class Workers:
 
     def send(self, command: str) -> None:
         for pipe in self._pipes:
-            pipe.send((command, None))
+            self._tell(pipe, (command, None))
+
+    def _tell(self, pipe, message) -> None:
+        try:
+            pipe.send(message)
+        except OSError:
+            self.close()
+            raise PdkitError(DIED) from None
 
     def receive(self) -> None:
         for pipe in self._pipes:
@@ -163,7 +171,7 @@ class Workers:
 
     def replay(self, histories):
         for pipe, part in zip(self._pipes, self._slices, strict=True):
-            pipe.send(("replay", histories[part]))
+            self._tell(pipe, ("replay", histories[part]))
         return [item for pipe in self._pipes for item in self._expect(pipe)]
 
     def close(self) -> None:
