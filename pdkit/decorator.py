@@ -42,6 +42,11 @@ class DecoratorConfig:
         if self.actor_input not in ACTOR_INPUTS:
             raise unknown("actor_input", self.actor_input, ACTOR_INPUTS)
 
+    @property
+    def mean_bound(self) -> float:
+        """The bound of |alpha * a_res|, averaged over the action dimensions."""
+        return self.alpha * (sum(self.alpha_scale) / len(self.alpha_scale) if self.alpha_scale else 1.0)
+
     def critic_dim(self, obs_dim: int, act_dim: int) -> int:
         return obs_dim + act_dim * (2 if self.critic_input == "concat" else 1)
 

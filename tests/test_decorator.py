@@ -18,6 +18,7 @@ def test_executed_action_is_base_plus_alpha_times_residual_and_is_not_clipped():
 
 def test_alpha_can_differ_between_action_dimensions():
     config = DecoratorConfig(alpha=0.1, alpha_scale=(1.0, 8.0))
+    assert config.mean_bound == pytest.approx(0.45) and DecoratorConfig(alpha=0.1).mean_bound == 0.1
     assert torch.allclose(compose(config, BASE, RESIDUAL), torch.tensor([[0.6, -1.3]]))
     assert np.allclose(compose(config, BASE.numpy(), RESIDUAL.numpy()), [[0.6, -1.3]])
     assert torch.allclose(critic_features(config, OBS, BASE, RESIDUAL), torch.tensor([[1, 2, 3, 0.6, -1.3]]))
