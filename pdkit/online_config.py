@@ -54,12 +54,12 @@ class OnlineConfig:
             raise PdkitError("The loop needs demo_fraction in [0, 1), gamma in (0, 1], n_step >= 1, utd >= 0 and batch >= 2.")
         if self.seed < 0:
             raise PdkitError(f"The seed must be 0 or more, not {self.seed}.")
-        if self.utd and self.batch > self.total_steps:
-            raise PdkitError(f"No update would be made: a batch ({self.batch}) is larger than all steps together ({self.total_steps}).")
         if self.demo_fraction and 0 in self.decorator.alpha_scale:
             raise PdkitError("Where alpha_scale is 0 no residual makes a demonstrated action; use a small factor, or demo_fraction=0.")
         if self.total_steps <= self.warmup_steps:
             raise PdkitError(f"total_steps ({self.total_steps}) must exceed warmup_steps ({self.warmup_steps}), or nothing is learned.")
+        if self.utd and self.batch > self.total_steps:
+            raise PdkitError(f"No update would be made: a batch ({self.batch}) is larger than all steps together ({self.total_steps}).")
 
 
 def stops(config: OnlineConfig, terminated: bool, truncated: bool) -> bool:
