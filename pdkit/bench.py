@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -153,6 +154,10 @@ def bench_updates(seconds: float, device: str) -> dict[str, Any]:
     out[f"SAC update, lesson profile (batch {lesson.batch}, {lesson.sac.layers}x{lesson.sac.hidden}, actor every "
         f"{lesson.sac.actor_every}) / float32 eager 3x256 (updates/s)"] = paired(updater(mine, lesson.batch, device),
                                                                                 updater(eager, lesson.batch, device), seconds)
+    if device == "cuda":  # on a CPU compiling takes minutes and gains nothing
+        compiled = SAC(39, 28, replace(lesson.sac, compile=True), lesson.decorator, device=device)
+        out["SAC update, lesson profile, torch.compile / without (updates/s)"] = paired(
+            updater(compiled, lesson.batch, device), updater(mine, lesson.batch, device), seconds)
     return out
 
 

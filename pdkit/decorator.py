@@ -8,6 +8,7 @@ Everything here is a pure function of tensors or arrays, so that each line can b
 """
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,7 +29,6 @@ class DecoratorConfig:
     H: int = 30_000  # primitive steps over which the gate opens; 0 means always open
     critic_input: str = "sum"  # sum: a_base + alpha * a_res; concat: both; residual: alpha * a_res alone
     actor_input: str = "obs"  # obs: the current observation; obs+base: with the base action
-    critic_action_scale: float = 1.0  # multiplies the actions that the critic sees: a residual is small beside the observation
 
     def __post_init__(self):
         if not 0 < self.alpha <= 1:
@@ -63,8 +63,15 @@ def scaled(config: DecoratorConfig, residual):
         return config.alpha * residual
     if len(config.alpha_scale) != residual.shape[-1]:
         raise PdkitError(f"alpha_scale has {len(config.alpha_scale)} factors; the action has {residual.shape[-1]} dimensions.")
-    factors = [config.alpha * factor for factor in config.alpha_scale]
-    return residual * (residual.new_tensor(factors) if isinstance(residual, torch.Tensor) else np.array(factors, residual.dtype))
+    if isinstance(residual, torch.Tensor):
+        return residual * _factors(config, residual.device, residual.dtype)
+    return residual * _factors(config, None, residual.dtype)
+
+
+@functools.lru_cache(maxsize=16)
+def _factors(config: DecoratorConfig, device: torch.device | None, dtype):
+    values = config.alpha * np.array(config.alpha_scale)
+    return values.astype(dtype) if device is None else torch.tensor(values, device=device, dtype=dtype)
 
 
 def compose(config: DecoratorConfig, base, residual):
@@ -74,12 +81,11 @@ def compose(config: DecoratorConfig, base, residual):
 
 def critic_features(config: DecoratorConfig, obs: torch.Tensor, base: torch.Tensor, residual: torch.Tensor) -> torch.Tensor:
     """What the critic sees, (B, critic_dim)."""
-    scale = config.critic_action_scale
     if config.critic_input == "sum":
-        return torch.cat([obs, scale * compose(config, base, residual)], dim=-1)
+        return torch.cat([obs, compose(config, base, residual)], dim=-1)
     if config.critic_input == "concat":
-        return torch.cat([obs, scale * base, scale * scaled(config, residual)], dim=-1)
-    return torch.cat([obs, scale * scaled(config, residual)], dim=-1)
+        return torch.cat([obs, base, scaled(config, residual)], dim=-1)
+    return torch.cat([obs, scaled(config, residual)], dim=-1)
 
 
 def actor_features(config: DecoratorConfig, obs: torch.Tensor, base: torch.Tensor) -> torch.Tensor:

@@ -20,7 +20,7 @@ from pathlib import Path
 
 from .errors import PdkitError
 from .files import DATA, ROOT, read_json, runs_root, sha256, write_json
-from .render_probe import SAPIEN_DRAWS
+from .machine import MUJOCO_DRAWS, SAPIEN_DRAWS, cpu_has_bf16
 
 REINSTALL = "run ./pd doctor, or pip install -r environment.txt"
 TIMEOUT = 60  # seconds a probe may take; a busy machine is slow, a hung driver never ends
@@ -144,7 +144,7 @@ def check_torch() -> list[Check]:
     text = f"{seen['threads']} threads, {cores} cores"
     fix = f"set OMP_NUM_THREADS={cores}: more threads than cores is many times slower"
     checks.append(Check("WARN", "threads", text, fix) if seen["threads"] > cores else Check("OK", "threads", text))
-    ratio, flag = seen["bfloat16"] / seen["float32"], _cpu_has_bf16()
+    ratio, flag = seen["bfloat16"] / seen["float32"], cpu_has_bf16()
     text = (f"one core: {seen['float32']:.0f} GFLOP/s in float32, {seen['bfloat16']:.0f} in bfloat16 ({ratio:.1f}x); "
             f"the CPU says {'yes' if flag else 'no'}")
     if ratio > 1.2 or not flag:
@@ -152,14 +152,6 @@ def check_torch() -> list[Check]:
     else:
         checks.append(Check("WARN", "bfloat16", text, "the machine may be busy; else train with bf16 off"))
     return checks
-
-
-def _cpu_has_bf16() -> bool:
-    try:
-        text = Path("/proc/cpuinfo").read_text()
-    except OSError:  # a Mac: the M2 and later have it, and only the timing tells
-        return False
-    return any(flag in text for flag in ("avx512_bf16", "amx_bf16", " bf16"))
 
 
 DOOR = """
@@ -186,21 +178,11 @@ def check_simulators() -> list[Check]:
 
 # ---- pictures --------------------------------------------------------------------------------------------------------
 
-MUJOCO_FRAME = """
-import mujoco
-model = mujoco.MjModel.from_xml_string('<mujoco><worldbody><light pos="0 0 3"/><geom size=".5"/></worldbody></mujoco>')
-data = mujoco.MjData(model); mujoco.mj_forward(model, data)
-renderer = mujoco.Renderer(model, 64, 64); renderer.update_scene(data)
-assert renderer.render().std() > 1, "the picture is empty"
-print("draws")
-"""
-
-
 def check_mujoco_pictures() -> list[Check]:
     """Each way in which MuJoCo can draw, tried; one is enough."""
     mac = sys.platform == "darwin"
     backends = ("cgl", "glfw") if mac else ("egl", "osmesa", "glfw")
-    results = {backend: probe(MUJOCO_FRAME, {"MUJOCO_GL": backend}) for backend in backends}
+    results = {backend: probe(MUJOCO_DRAWS, {"MUJOCO_GL": backend}) for backend in backends}
     if not mac and not results["glfw"][0] and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         results["glfw"] = (False, "no display")
     fixes = {"egl": "sudo apt-get install -y libegl1 libgl1", "osmesa": "sudo apt-get install -y libosmesa6"}

@@ -42,7 +42,7 @@ class LeverSim:
 
 
 class CorridorSim:
-    """Position on a line from 0; each step moves by 0.25 times the action; solved beyond 1."""
+    """Position on a line from 0; each step moves by 0.25 times the action; solved beyond 0.9: four steps at full speed, and no exact ones are needed."""
 
     def reset(self, seed: int) -> np.ndarray:
         self.x = 0.0
@@ -50,7 +50,7 @@ class CorridorSim:
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, bool]:
         self.x = float(np.clip(self.x + 0.25 * np.clip(action[0], -1, 1), -1, 1.25))
-        return np.array([self.x], np.float32), self.x > 0.99
+        return np.array([self.x], np.float32), self.x > 0.9
 
     def close(self) -> None: ...
 

@@ -25,7 +25,7 @@ _PAPER: dict[str, Any] = dict(
     actor_lr=1e-4, critic_lr=1e-4, critic_layer_norm=False, log_std_range=(-20.0, 2.0), init_temperature=1.0, average=0.0, bf16=False,
 )
 # Per task: alpha, H and step budget of the official commands (facts.md 1.4). For the Adroit tasks the paper's values are not
-# known: the defaults of the official script stand in, and a run says so.
+# known: the defaults of the official script stand in.
 _PAPER_TASK: dict[str, dict[str, Any]] = {"StackCube": dict(alpha=0.03, H=1_000_000)}
 
 _LESSON: dict[str, Any] = {}  # the defaults of OnlineConfig, DecoratorConfig and SACConfig

@@ -7,6 +7,7 @@ import functools
 import torch
 
 from .errors import PdkitError
+from .machine import cpu_has_bf16
 
 
 def set_threads(num: int) -> None:
@@ -32,16 +33,7 @@ def has_bf16(device: str = "cpu") -> bool:
         return torch.cuda.is_bf16_supported()
     capability = torch.cpu.get_capabilities() if hasattr(torch.cpu, "get_capabilities") else {}
     flags = {k.lower() for k, v in capability.items() if v}
-    return bool(flags & {"avx512_bf16", "amx_bf16", "bf16"}) or _cpuinfo_bf16()
-
-
-def _cpuinfo_bf16() -> bool:
-    try:
-        with open("/proc/cpuinfo") as handle:
-            text = handle.read()
-    except OSError:
-        return False
-    return "avx512_bf16" in text or "amx_bf16" in text
+    return bool(flags & {"avx512_bf16", "amx_bf16", "bf16"}) or cpu_has_bf16()
 
 
 def autocast(device: str, enabled: bool):

@@ -23,7 +23,7 @@ from .policies import POLICIES, Policy, load_policy, save_policy
 from .policies.base import read_card
 from .profiles import PROFILES, checked, differences, flat, online_config
 from .recorded import record
-from .runs import Run, describe_machine
+from .runs import Run, describe_machine, origin
 from .seeds import reported_seeds
 from .tasks import get_task
 from .tensorboard import Board
@@ -118,9 +118,7 @@ def _decorated(args) -> int:
         print(f"{args.task}, seed {seed}: " + str(differences(config, args.profile) or "the profile unchanged"), flush=True)
         out = Path(args.out or runs_root() / "train") / f"{args.task}-{args.recipe}-seed{seed}"
         demos = base_demos(args) if config.demo_fraction else None
-        origin = {"base": read_card(base_folder)["weights_sha256"], "demos": demos.checksum if demos else None,
-                  "num_demos": demos.num if demos else 0}
-        row, base_table = decorate(config, base, demos, out, args.episodes, origin, base_table, args.tensorboard)
+        row, base_table = decorate(config, base, demos, out, args.episodes, origin(read_card(base_folder), demos), base_table, args.tensorboard)
         row |= {"recipe": args.recipe, "command": command_of(args, seed)}
         print(", ".join(f"{k} {v}" for k, v in row.items()), flush=True)
         if args.record:
@@ -144,14 +142,14 @@ def command_of(args, seed: int) -> str:
     return " ".join(parts + ([f"--record {args.record}"] if args.record else []))
 
 
-def decorate(config, base: Policy, demos: Demos | None, out: Path, episodes: int, origin: dict[str, Any],
+def decorate(config, base: Policy, demos: Demos | None, out: Path, episodes: int, started_from: dict[str, Any],
              base_table: pd.DataFrame | None = None, tensorboard: bool = False) -> tuple[dict[str, Any], pd.DataFrame]:
     """Train (or resume) one seed in `out` and evaluate base and decorated on the same test seeds.
 
-    `origin` tells which base policy and demonstrations these are; a run is resumed only with the same ones.
+    `started_from` (see `origin`) tells which base policy and demonstrations these are; a run is resumed only with the same ones.
     Returns one row of evidence, and the base policy's episodes: the next seed's too, so they can be passed on as `base_table`.
     """
-    run = Run(out, "decorated", flat(config) | origin)
+    run = Run(out, "decorated", flat(config) | started_from)
     trainer = Trainer(config, base, demos)
     board, shown = Board(out) if tensorboard else None, set()
 

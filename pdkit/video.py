@@ -21,7 +21,8 @@ import pandas as pd
 from .decorated import Decorated
 from .decorator import compose, scaled
 from .errors import PdkitError
-from .files import ROOT, atomic_file
+from .files import atomic_file
+from .machine import MUJOCO_DRAWS
 from .plots import COLORS, Picture, blank, styled
 from .policies import Policy
 from .tasks.spec import TaskSpec
@@ -73,17 +74,6 @@ class Clip:
 
 # ---- whether pictures can be drawn ---------------------------------------------------------------------------------
 
-_PROBE = """
-from pdkit.tasks import get_task
-sim = get_task("Door").make(render=True)
-sim.reset(0)
-picture = sim.render()
-sim.close()
-assert picture.std() > 1, "the picture is empty"
-print("DRAWS")
-"""
-
-
 def try_render(spec: TaskSpec) -> str | None:
     """None if episodes of this task can be drawn here, else one sentence that says why not.
 
@@ -101,16 +91,14 @@ def _try_mujoco() -> str | None:
     others = ("egl", "osmesa") if sys.platform.startswith("linux") else ("",)
     reason = ""
     for backend in dict.fromkeys((chosen, *others) if chosen else others):
-        environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
-        if backend:
-            environment["MUJOCO_GL"] = backend
+        environment = os.environ | ({"MUJOCO_GL": backend} if backend else {})
         try:
-            done = subprocess.run([sys.executable, "-W", "ignore", "-c", _PROBE], env=environment, capture_output=True,
+            done = subprocess.run([sys.executable, "-W", "ignore", "-c", MUJOCO_DRAWS], env=environment, capture_output=True,
                                   text=True, timeout=120)
         except subprocess.TimeoutExpired:
             reason = reason or f"{backend or 'the default backend'} did not answer"
             continue
-        if done.returncode == 0 and "DRAWS" in done.stdout:
+        if done.returncode == 0 and "draws" in done.stdout:
             if backend:
                 os.environ["MUJOCO_GL"] = backend
             return None

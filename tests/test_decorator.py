@@ -26,11 +26,6 @@ def test_alpha_can_differ_between_action_dimensions():
         compose(DecoratorConfig(alpha_scale=(1.0, 1.0, 1.0)), BASE, RESIDUAL)
 
 
-def test_the_critic_can_see_actions_on_another_scale():
-    config = DecoratorConfig(alpha=0.2, critic_action_scale=5.0)
-    assert torch.allclose(critic_features(config, OBS, BASE, RESIDUAL), torch.tensor([[1, 2, 3, 3.5, -3.5]]))
-
-
 @pytest.mark.parametrize(("kind", "expected"), [
     ("sum", [1, 2, 3, 0.7, -0.7]),
     ("concat", [1, 2, 3, 0.5, -0.5, 0.2, -0.2]),

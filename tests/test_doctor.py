@@ -83,9 +83,9 @@ def test_more_threads_than_cores_is_a_warning(monkeypatch):
     torch, threads, bf16 = doctor.check_torch()
     assert (torch.status, threads.status, bf16.status) == ("OK", "WARN", "OK") and "OMP_NUM_THREADS" in threads.fix
     seen.update(threads=1, bfloat16=50.0)
-    monkeypatch.setattr(doctor, "_cpu_has_bf16", lambda: False)
+    monkeypatch.setattr(doctor, "cpu_has_bf16", lambda: False)
     assert statuses(doctor.check_torch()) == ["OK", "OK", "--"]
-    monkeypatch.setattr(doctor, "_cpu_has_bf16", lambda: True)
+    monkeypatch.setattr(doctor, "cpu_has_bf16", lambda: True)
     assert statuses(doctor.check_torch()) == ["OK", "OK", "WARN"]
 
 

@@ -226,7 +226,7 @@ def test_pictures_can_be_turned_off(monkeypatch):
 
 
 def test_a_crashing_driver_is_a_sentence(fresh_probe):
-    fresh_probe.setattr(video, "_PROBE", "import os; os.kill(os.getpid(), 11)")
+    fresh_probe.setattr(video, "MUJOCO_DRAWS", "import os; os.kill(os.getpid(), 11)")
     reason = video.try_render(get_task("Door"))
     assert reason.startswith("No pictures: MuJoCo cannot draw here") and "doctor" in reason and "\n" not in reason
 
@@ -234,7 +234,7 @@ def test_a_crashing_driver_is_a_sentence(fresh_probe):
 def test_the_backend_that_works_is_chosen(fresh_probe):
     fresh_probe.setenv("MUJOCO_GL", "broken")
     fresh_probe.setattr(video.sys, "platform", "linux")
-    fresh_probe.setattr(video, "_PROBE", "import os; assert os.environ['MUJOCO_GL'] == 'osmesa'; print('DRAWS')")
+    fresh_probe.setattr(video, "MUJOCO_DRAWS", "import os; assert os.environ['MUJOCO_GL'] == 'osmesa'; print('draws')")
     assert video.try_render(get_task("Door")) is None and os.environ["MUJOCO_GL"] == "osmesa"
 
 

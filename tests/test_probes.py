@@ -49,20 +49,20 @@ def test_corridor_values_are_discounted_distances(n_step):
     assert success("corridor", policy) == 1.0
     right = torch.tensor([[0.0, 1.0], [0.25, 1.0], [0.5, 1.0], [0.75, 1.0]])
     values = trainer.agent.critics(right).min(0).values.detach().numpy()
-    assert (np.diff(values) > 0.1).all()  # nearer is better
+    assert (np.diff(values) > 0.5).all()  # nearer is better
     assert values[-1] > -1.0  # the solving step earns 1 - 1 = 0 and stops
-    assert values[0] == pytest.approx(-1 - 0.9 - 0.81, abs=1.5)  # three steps at -1 before it
+    assert values[0] == pytest.approx(-1 - 0.9 - 0.81, abs=0.6)  # three steps at -1 before it
 
 
 @pytest.mark.parametrize("critic_input", ["sum", "concat", "residual"])
 def test_reach_needs_the_decorator(critic_input):
     base = biased_base()
     before = evaluate(PROBES["reach"], base.act, reported_seeds(100), num_envs=20).success_once.mean()
-    decorator = DecoratorConfig(alpha=0.6, H=1000, critic_input=critic_input)
-    _, policy = train("reach", base, decorator, total_steps=4500, warmup_steps=500, n_step=3)
+    decorator = DecoratorConfig(alpha=0.8, H=1000, critic_input=critic_input)
+    _, policy = train("reach", base, decorator, total_steps=3000, warmup_steps=500, n_step=3)
     after = success("reach", policy)
     assert before < 0.35
-    assert after > 0.8
+    assert after > 0.9
 
 
 def test_a_bound_smaller_than_the_error_cannot_close_it():

@@ -16,7 +16,7 @@ from functools import lru_cache
 from typing import Any
 
 from ..errors import PdkitError
-from ..render_probe import SAPIEN_DRAWS
+from ..machine import SAPIEN_DRAWS
 
 PICTURE = 256  # pixels a side of a rendered frame
 

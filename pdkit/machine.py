@@ -1,4 +1,27 @@
-"""The script that tells whether SAPIEN can draw here. Standard library only: `pdkit doctor` uses it on a broken installation too."""
+"""What this machine can do, asked without importing anything that may be broken: standard library only, for `pdkit doctor` too."""
+from __future__ import annotations
+
+from pathlib import Path
+
+
+def cpu_has_bf16() -> bool:
+    """Whether the CPU multiplies bfloat16 matrices itself, as Linux tells; False where it does not tell (a Mac)."""
+    try:
+        text = Path("/proc/cpuinfo").read_text()
+    except OSError:
+        return False
+    return any(flag in text for flag in ("avx512_bf16", "amx_bf16"))
+
+
+# Draws a ball with the backend in MUJOCO_GL.
+MUJOCO_DRAWS = """
+import mujoco
+model = mujoco.MjModel.from_xml_string('<mujoco><worldbody><light pos="0 0 3"/><geom size=".5"/></worldbody></mujoco>')
+data = mujoco.MjData(model); mujoco.mj_forward(model, data)
+renderer = mujoco.Renderer(model, 64, 64); renderer.update_scene(data)
+assert renderer.render().std() > 1, "the picture is empty"
+print("draws")
+"""
 
 # Draws a box on the first device that can, and prints the device's name. Run in a process of its own, because SAPIEN may
 # crash instead of raising where there is no driver.
