@@ -42,7 +42,7 @@ class LeverSim:
 
 
 class CorridorSim:
-    """Position on a line from 0; each step moves by 0.25 times the action; solved beyond 0.9: four steps at full speed, and no exact ones are needed."""
+    """Position on a line from 0; each step moves by 0.25 times the action; solved beyond 0.9, in four steps at nearly full speed."""
 
     def reset(self, seed: int) -> np.ndarray:
         self.x = 0.0

@@ -118,7 +118,8 @@ def _decorated(args) -> int:
         print(f"{args.task}, seed {seed}: " + str(differences(config, args.profile) or "the profile unchanged"), flush=True)
         out = Path(args.out or runs_root() / "train") / f"{args.task}-{args.recipe}-seed{seed}"
         demos = base_demos(args) if config.demo_fraction else None
-        row, base_table = decorate(config, base, demos, out, args.episodes, origin(read_card(base_folder), demos), base_table, args.tensorboard)
+        started_from = origin(read_card(base_folder), demos)
+        row, base_table = decorate(config, base, demos, out, args.episodes, started_from, base_table, args.tensorboard)
         row |= {"recipe": args.recipe, "command": command_of(args, seed)}
         print(", ".join(f"{k} {v}" for k, v in row.items()), flush=True)
         if args.record:
