@@ -9,18 +9,19 @@ import contextlib
 import copy
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import torch
+from torch import nn
 
-from .decorated import Decorated
+from .decorated import Decorated, save_decorated
 from .decorator import compose, gate, gate_probability, scaled
 from .demos.format import Demos
 from .errors import PdkitError
 from .online_config import OnlineConfig, stops
 from .online_eval import Evaluations
 from .policies import Policy
-from .rl.networks import Actor
 from .rl.replay import NStep, Replay
 from .rl.sac import SAC
 from .runs import Run
@@ -31,7 +32,13 @@ from .tasks.vector import Episode, VectorEnv
 from .torch_setup import pick_device
 
 
-def demo_rows(demos: Demos, base: Policy, config: OnlineConfig) -> list[np.ndarray]:
+def last_observation(windows: np.ndarray) -> np.ndarray:
+    """What most methods store of windows (N, window, obs_dim): the latest observations (N, obs_dim)."""
+    return windows[:, -1]
+
+
+def demo_rows(demos: Demos, base: Policy, config: OnlineConfig,
+              view: Callable[[np.ndarray], np.ndarray] = last_observation) -> list[np.ndarray]:
     """Demonstrations as replay rows: the residual stored is the one that makes the executed action the demonstrated one.
 
     An episode ends as training episodes do: at its first success with on_success="terminate", else at its own end, as a
@@ -45,12 +52,12 @@ def demo_rows(demos: Demos, base: Policy, config: OnlineConfig) -> list[np.ndarr
             length = int(np.argmax(success)) + 1
         padded = np.concatenate([np.repeat(observations[:1], base.window - 1, axis=0), observations])
         windows = np.lib.stride_tricks.sliding_window_view(padded, base.window, axis=0).transpose(0, 2, 1)[: length + 1]
-        bases = base.act(windows)[:, 0]
+        bases, seen = base.act(windows)[:, 0], view(windows)
         residuals = (actions[:length] - bases[:length]) / np.maximum(scaled(config.decorator, np.ones_like(bases[:length])), 1e-6)
         for t in range(length):
             last = t == length - 1
             terminated = last and config.on_success == "terminate" and bool(success[t])
-            rows += steps.push(0, observations[t], residuals[t], bases[t], float(success[t]) + config.reward_shift, observations[t + 1],
+            rows += steps.push(0, seen[t], residuals[t], bases[t], float(success[t]) + config.reward_shift, seen[t + 1],
                                bases[t + 1], stops(config, terminated, last and not terminated), last)
     return rows
 
@@ -70,13 +77,12 @@ class Trainer:
         torch.manual_seed(config.seed)
         self.rng = np.random.default_rng([config.seed, 1])
         self.generator = torch.Generator().manual_seed(config.seed)
-        normalize = base.normalizer if config.normalize_obs else None
-        dims = (self.spec.obs_dim, self.spec.act_dim)
-        self.agent = SAC(*dims, config.sac, config.decorator, normalize=normalize, device=config.device)
+        self.agent = self._make_agent()
+        dims = (self.stored_dim, self.spec.act_dim)
         self.replay = Replay(config.total_steps, *dims, device=config.device)
         self.demos = None
         if demos is not None and config.demo_fraction:
-            rows = demo_rows(demos, base, config)
+            rows = demo_rows(demos, base, config, self._view)
             self.demos = Replay(len(rows), *dims, device=config.device)
             self.demos.add(rows)
         elif config.demo_fraction:
@@ -88,27 +94,51 @@ class Trainer:
         self.best_score, self.best_actor = -1.0, {}  # of the evaluations so far
         self._unscored: dict[int, dict[str, torch.Tensor]] = {}  # of a checkpoint: actors whose evaluation had not come back
 
+    # ---- what a method may do otherwise: see pdkit/methods ----
+
+    _view = staticmethod(last_observation)  # what is stored of a window, and what the agent sees
+
+    @property
+    def stored_dim(self) -> int:
+        """Width of what `_view` gives."""
+        return self.spec.obs_dim
+
+    def _make_agent(self) -> SAC:
+        c = self.config
+        return SAC(self.spec.obs_dim, self.spec.act_dim, c.sac, c.decorator, device=c.device,
+                   normalize=self.base.normalizer if c.normalize_obs else None)
+
+    def _as_policy(self, actor: nn.Module, base: Policy) -> Decorated | Policy:
+        """What is evaluated and reported: this actor as a policy."""
+        return Decorated(base, actor, self.config.decorator, normalize=self.config.normalize_obs)
+
+    def save_policy(self, policy: Decorated | Policy, folder: Path) -> None:
+        """Write a policy that `_as_policy` made."""
+        save_decorated(policy, folder, {"task": self.config.task, "seed": self.config.seed})
+
+    # ---- the loop ----
+
     def _next_seed(self, lane: int) -> int:
         self.episode_counts[lane] += 1
         return training_seed(self.config.seed, lane, self.episode_counts[lane])
 
     @property
-    def policy(self) -> Decorated:
-        """The decorated policy as it stands (the averaged actor)."""
-        return Decorated(self.base, self._actor, self.config.decorator, normalize=self.config.normalize_obs)
+    def policy(self) -> Decorated | Policy:
+        """The policy as it stands (the averaged actor)."""
+        return self._as_policy(self._actor, self.base)
 
     @property
-    def _actor(self) -> Actor:
+    def _actor(self) -> nn.Module:
         return self.agent.average if self.config.sac.average else self.agent.actor
 
-    def result(self) -> Decorated:
+    def result(self) -> Decorated | Policy:
         """The policy that the run ends with: the last, or the one selected on the selection seeds."""
         chosen = copy.deepcopy(self._actor)
         if self.best_actor:
             chosen.load_state_dict(self.best_actor)
-        return Decorated(self.base, chosen, self.config.decorator, normalize=self.config.normalize_obs)
+        return self._as_policy(chosen, self.base)
 
-    def train(self, run: Run | None = None, progress: Callable[[Trainer], None] | None = None) -> Decorated:
+    def train(self, run: Run | None = None, progress: Callable[[Trainer], None] | None = None) -> Decorated | Policy:
         """Run to `total_steps`, from a checkpoint in `run` if there is one; `progress(self)` is called for each new row of
         `rows`, and again when the evaluation that belongs to a row comes back.
 
@@ -125,12 +155,12 @@ class Trainer:
             while self.step < c.total_steps:
                 started = time.monotonic()
                 before = self.step
-                residual = self._explore(windows[:, -1], base)
+                residual = self._explore(self._view(windows), base)
                 envs.send(compose(c.decorator, base, residual)[:, None])
                 self._learn()
                 result = envs.receive()
                 base_next, base_final = self._base_actions(result)
-                self._store(windows[:, -1], residual, base, result, base_final)
+                self._store(self._view(windows), residual, base, result, base_final)
                 windows, base = result.windows, base_next
                 self.step += int(result.steps.sum())
                 self.recent += result.episodes
@@ -148,8 +178,9 @@ class Trainer:
         return self.result()
 
     def _evaluations(self) -> Evaluations:
-        c = self.config
-        return Evaluations(self.spec, self.base, self._actor, c.decorator, normalize=c.normalize_obs, episodes=c.eval_episodes, seed=c.seed,
+        c, actor = self.config, copy.deepcopy(self._actor).cpu()
+        policy = self._as_policy(actor, copy.deepcopy(self.base).cpu())
+        return Evaluations(self.spec, policy, actor, episodes=c.eval_episodes, seed=c.seed,
                            workers=c.eval_workers if c.eval_every and c.eval_episodes else 0)
 
     def _start(self, envs: VectorEnv, run: Run | None):
@@ -164,7 +195,7 @@ class Trainer:
     def _explore(self, obs: np.ndarray, base: np.ndarray) -> np.ndarray:
         """Gated residuals (N, act_dim) to execute and store."""
         c, shape = self.config, base.shape
-        if self.step < c.warmup_steps:
+        if self.step < c.warmup_steps and c.warmup != "policy":
             residual = np.zeros(shape, np.float32) if c.warmup == "base" else self.rng.uniform(-1, 1, shape).astype(np.float32)
         else:
             noise = torch.from_numpy(self.rng.standard_normal(shape).astype(np.float32)).to(c.device)
@@ -195,11 +226,11 @@ class Trainer:
         return upcoming, final
 
     def _store(self, obs, residual, base, result, base_final) -> None:
-        c = self.config
+        c, final = self.config, self._view(result.final_windows)
         for i in range(c.num_envs):
             stop = stops(c, bool(result.terminated[i]), bool(result.truncated[i]))
             self.replay.add(self.nstep.push(i, obs[i], residual[i], base[i], float(result.reward[i]) + c.reward_shift,
-                                            result.final_windows[i, -1], base_final[i], stop, bool(result.done[i])))
+                                            final[i], base_final[i], stop, bool(result.done[i])))
 
     def _crossed(self, before: int, every: int) -> bool:
         """Whether a multiple of `every` steps (or the end) lies between `before` and now."""
@@ -265,7 +296,7 @@ class Trainer:
         replay = torch.from_numpy(arrays["replay"])
         self.replay.rows[: len(replay)] = replay
         self.replay.size, self.replay.position = len(replay), values["position"]
-        self.nstep.load(group("nstep"), self.spec.obs_dim, self.spec.act_dim)
+        self.nstep.load(group("nstep"), self.stored_dim, self.spec.act_dim)
         self.generator.set_state(torch.from_numpy(arrays["generator"]))
         torch.set_rng_state(torch.from_numpy(arrays["torch_rng"]))
         self.rng.bit_generator.state = values["rng"]

@@ -5,9 +5,10 @@ from dataclasses import dataclass, field
 
 from .decorator import DecoratorConfig
 from .errors import PdkitError, unknown
+from .methods.config import MethodConfig
 from .rl.sac import SACConfig
 
-WARMUPS = ("base", "uniform")
+WARMUPS = ("base", "uniform", "policy")
 SELECTIONS = ("last", "best")
 ON_SUCCESS = ("terminate", "continue")
 BOOTSTRAPS = ("truncated", "never", "always")
@@ -23,7 +24,7 @@ class OnlineConfig:
     num_envs: int = 8
     env_workers: int = 1  # processes that step environments while this one learns; results do not depend on it
     warmup_steps: int = 6_000  # steps stored before learning starts
-    warmup: str = "base"  # actions until then: the base policy's, or base plus a gated uniform residual (the paper's code)
+    warmup: str = "base"  # actions until then: the base policy's, base plus a gated uniform residual (the paper's code), or the actor's
     utd: float = 0.25  # gradient updates per environment step after the warm-up
     batch: int = 256
     demo_fraction: float = 0.25  # of each batch, drawn from the demonstrations
@@ -43,6 +44,8 @@ class OnlineConfig:
     log_every: int = 2_500
     checkpoint_every: int = 15_000
     device: str = "cpu"
+    method: str = "policy_decorator"  # see pdkit/methods
+    method_config: MethodConfig = field(default_factory=MethodConfig)
     decorator: DecoratorConfig = field(default_factory=DecoratorConfig)
     sac: SACConfig = field(default_factory=SACConfig)
 

@@ -4,7 +4,6 @@ An evaluation depends only on the actor it is given, so when it comes back chang
 """
 from __future__ import annotations
 
-import copy
 import multiprocessing
 import signal
 import time
@@ -14,7 +13,6 @@ import torch
 from torch import nn
 
 from .decorated import Decorated
-from .decorator import DecoratorConfig
 from .errors import PdkitError
 from .evaluate import evaluate
 from .policies import Policy
@@ -31,16 +29,15 @@ class Evaluations:
     """Scores actors on the selection seeds, one after the other, in the order in which they were submitted.
 
     Args:
-        spec, base, actor, decorator, normalize: what an actor's weights become a policy with; copied to the CPU.
+        spec: the task.
+        policy, actor: a policy, and the part of it that an actor's weights are loaded into; both on the CPU and used by nobody else.
         episodes: selection episodes of each evaluation.
         seed: restarts the base policy's random numbers before each evaluation.
         workers: 1 evaluates in another process, 0 in this one (then `collect` does the work).
     """
 
-    def __init__(self, spec: TaskSpec, base: Policy, actor: nn.Module, decorator: DecoratorConfig, *, normalize: bool, episodes: int,
-                 seed: int, workers: int):
-        policy = Decorated(copy.deepcopy(base).cpu(), copy.deepcopy(actor).cpu(), decorator, normalize=normalize)
-        self._arguments = (spec, policy, episodes, seed)
+    def __init__(self, spec: TaskSpec, policy: Policy | Decorated, actor: nn.Module, *, episodes: int, seed: int, workers: int):
+        self._arguments = (spec, policy, actor, episodes, seed)
         self.pending: dict[int, State] = {}  # step -> weights not scored yet: part of a checkpoint
         self._process, self._busy = None, False
         if workers:
@@ -98,9 +95,9 @@ class Evaluations:
 
 
 @torch.no_grad()
-def _score(spec: TaskSpec, policy: Decorated, episodes: int, seed: int, weights: State) -> dict[str, float]:
+def _score(spec: TaskSpec, policy: Policy | Decorated, actor: nn.Module, episodes: int, seed: int, weights: State) -> dict[str, float]:
     started = time.monotonic()
-    policy.actor.load_state_dict(weights)
+    actor.load_state_dict(weights)
     state = torch.get_rng_state()  # a base policy may draw from torch's global generator, and so does training
     policy.reset(seed)
     table = evaluate(spec, policy.act, selection_seeds(episodes), window=policy.window, num_envs=LANES)

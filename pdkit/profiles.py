@@ -6,10 +6,13 @@ names are errors, and `changes` tells what differs from the profile.
 from __future__ import annotations
 
 import dataclasses
+import functools
+import operator
 from typing import Any
 
 from .decorator import DecoratorConfig
 from .errors import PdkitError, unknown
+from .methods.config import MethodConfig
 from .online_config import OnlineConfig
 from .rl.sac import SACConfig
 from .tasks import get_task
@@ -40,7 +43,7 @@ _LESSON_TASK: dict[str, dict[str, Any]] = {
 _SMOKE: dict[str, Any] = dict(total_steps=600, warmup_steps=200, H=400, num_envs=4, env_workers=0, eval_workers=0, utd=0.1, batch=64,
                               eval_every=600, eval_episodes=2, log_every=200, checkpoint_every=300, hidden=32)
 
-_PARTS = {"decorator": DecoratorConfig, "sac": SACConfig}
+_PARTS = {"decorator": DecoratorConfig, "sac": SACConfig, "method_config": MethodConfig}
 _FIELDS = {f.name: part for part, cls in _PARTS.items() for f in dataclasses.fields(cls)}
 _LOOP = {f.name for f in dataclasses.fields(OnlineConfig)} - set(_PARTS)
 
@@ -95,7 +98,7 @@ def flat(config: OnlineConfig) -> dict[str, Any]:
     """All fields of a configuration by flat name, as JSON types: what a manifest stores."""
     values = dataclasses.asdict(config)
     parts = {name: values.pop(name) for name in _PARTS}
-    return {k: list(v) if isinstance(v, tuple) else v for k, v in (values | parts["decorator"] | parts["sac"]).items()}
+    return {k: list(v) if isinstance(v, tuple) else v for k, v in functools.reduce(operator.or_, parts.values(), values).items()}
 
 
 def differences(config: OnlineConfig, profile: str) -> dict[str, tuple[Any, Any]]:

@@ -12,7 +12,6 @@ from typing import Any
 import pandas as pd
 
 from .cli import Parser
-from .decorated import save_decorated
 from .demos import Demos, load_demos, sources
 from .errors import PdkitError, unknown
 from .evaluate import evaluate
@@ -167,7 +166,7 @@ def decorate(config, base: Policy, demos: Demos | None, out: Path, episodes: int
     if board:
         board.close()
     run.write_metrics(trainer.rows)
-    save_decorated(policy, out / "decorated", {"task": config.task, "seed": config.seed})
+    trainer.save_policy(policy, out / "decorated")
     tables = {} if base_table is None else {"base": base_table}
     for name, actor in (("base", base), ("decorated", policy)):
         if name not in tables:

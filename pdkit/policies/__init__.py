@@ -3,8 +3,10 @@ from __future__ import annotations
 
 from .base import Normalizer, Policy, load_policy, save_policy
 from .bet import BeT
+from .bet_sac import BeTForSAC
 from .mlp import MLP
+from .zero import Zero
 
-POLICIES: dict[str, type[Policy]] = {cls.kind: cls for cls in (BeT, MLP)}
+POLICIES: dict[str, type[Policy]] = {cls.kind: cls for cls in (BeT, BeTForSAC, MLP, Zero)}
 
-__all__ = ["POLICIES", "BeT", "MLP", "Normalizer", "Policy", "load_policy", "save_policy"]
+__all__ = ["POLICIES", "BeT", "BeTForSAC", "MLP", "Normalizer", "Policy", "Zero", "load_policy", "save_policy"]

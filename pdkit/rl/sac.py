@@ -15,11 +15,18 @@ from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
+from torch import nn
 
 from ..decorator import DecoratorConfig, actor_features, critic_features
-from ..errors import PdkitError
+from ..errors import PdkitError, unknown
 from ..torch_setup import autocast
 from .networks import Actor, Critics
+
+ACTOR_VALUES = ("min", "mean")
+
+
+def _same(x: torch.Tensor) -> torch.Tensor:
+    return x
 
 
 @dataclass(frozen=True)
@@ -39,6 +46,9 @@ class SACConfig:
     autotune: bool = True  # learn the temperature
     target_entropy_scale: float = 1.0  # target entropy = -scale * act_dim
     entropy_backup: bool = True  # the entropy term inside the target
+    target_subset: int = 0  # the target takes the least of so many critics, drawn anew each update (RLPD: 2 of 10); 0: of all
+    actor_value: str = "min"  # what the actor climbs: the least critic, or their mean (RLPD)
+    critic_warmup: int = 0  # updates before the actor moves (appendix F.5.2); the temperature is learned meanwhile
     grad_clip: float = 50.0  # global norm, separately for each critic and the actor
     residual_penalty: float = 1.0  # weight of mean a_res^2 in the actor's loss: no drift where the critic has no preference
     actor_every: int = 2  # critic updates per actor update
@@ -49,18 +59,29 @@ class SACConfig:
     def __post_init__(self):
         if self.num_critics < 1 or self.actor_lr <= 0 or self.critic_lr <= 0 or not 0 < self.tau <= 1 or not 0 <= self.average < 1:
             raise PdkitError("SAC needs num_critics >= 1, positive learning rates, tau in (0, 1] and average in [0, 1).")
+        if not 0 <= self.target_subset <= self.num_critics or self.critic_warmup < 0:
+            raise PdkitError("SAC needs target_subset from 0 to num_critics, and critic_warmup of 0 or more.")
+        if self.actor_value not in ACTOR_VALUES:
+            raise unknown("actor_value", self.actor_value, ACTOR_VALUES)
 
 
 class SAC:
-    """The learner. `normalize` maps observations (B, obs_dim) before any network sees them (identity by default)."""
+    """The learner.
+
+    Args:
+        obs_dim, act_dim: what critics see of an observation, and the action.
+        normalize: maps stored observations before any network sees them (identity by default).
+        actor: another actor than the small Gaussian one: a module with `sample` and `mean_action` as `Actor` has them.
+        critic_view: what critics see of a normalised observation, (B, stored) -> (B, obs_dim); all of it by default.
+    """
 
     def __init__(self, obs_dim: int, act_dim: int, config: SACConfig, decorator: DecoratorConfig, *, normalize=None,
-                 device: str = "cpu"):
+                 actor: nn.Module | None = None, critic_view=None, device: str = "cpu"):
         self.config, self.decorator, self.device = config, decorator, device
-        self.normalize = normalize or (lambda obs: obs)
+        self.normalize, self.critic_view = normalize or _same, critic_view or _same
         c = config
-        self.actor = Actor(decorator.actor_dim(obs_dim, act_dim), act_dim, c.hidden, c.layers, c.actor_layer_norm,
-                           c.log_std_range).to(device)
+        self.actor = (actor or Actor(decorator.actor_dim(obs_dim, act_dim), act_dim, c.hidden, c.layers, c.actor_layer_norm,
+                                     c.log_std_range)).to(device)
         self.critics = Critics(decorator.critic_dim(obs_dim, act_dim), c.hidden, c.layers, c.num_critics, c.critic_layer_norm).to(device)
         self.targets = copy.deepcopy(self.critics).requires_grad_(False)
         self.average = copy.deepcopy(self.actor).requires_grad_(False)
@@ -70,7 +91,7 @@ class SAC:
             self.actor.heads = torch.compile(self.actor.heads)
         self.log_temperature = torch.full((), math.log(c.init_temperature), device=device, requires_grad=c.autotune)
         self.target_entropy = -c.target_entropy_scale * act_dim
-        self.actor_optimizer = torch.optim.Adam(self.actor.parameters(), lr=c.actor_lr, fused=True)
+        self.actor_optimizer = torch.optim.Adam([p for p in self.actor.parameters() if p.requires_grad], lr=c.actor_lr, fused=True)
         self.critic_optimizer = torch.optim.Adam(self.critics.parameters(), lr=c.critic_lr, fused=True)
         self.temperature_optimizer = torch.optim.Adam([self.log_temperature], lr=c.critic_lr, fused=True) if c.autotune else None
         self.updates = 0
@@ -90,7 +111,9 @@ class SAC:
         obs, next_obs = self.normalize(batch["obs"]), self.normalize(batch["next_obs"])
         noise = torch.randn((2, *batch["base"].shape), generator=generator).to(self.device)
         temperature = self.log_temperature.detach().exp()
-        log = self._update_critics(batch, obs, next_obs, noise[0], temperature)
+        c = self.config
+        members = torch.randperm(c.num_critics, generator=generator)[: c.target_subset] if c.target_subset else None
+        log = self._update_critics(batch, obs, next_obs, noise[0], temperature, members)
         if self.updates % self.config.actor_every == 0:
             log |= self._update_actor(batch, obs, noise[1], temperature)
         with torch.no_grad():
@@ -98,19 +121,21 @@ class SAC:
         self.updates += 1
         return log
 
-    def td_target(self, batch, next_obs, noise, temperature) -> torch.Tensor:
-        """y, (B,)."""
+    def td_target(self, batch, next_obs, noise, temperature, members: torch.Tensor | None = None) -> torch.Tensor:
+        """y, (B,); the least of the target critics `members`, or of all."""
         with torch.no_grad(), autocast(self.device, self.config.bf16):
             residual, log_pi = self.actor.sample(actor_features(self.decorator, next_obs, batch["next_base"]), noise)
-            value = self.targets(critic_features(self.decorator, next_obs, batch["next_base"], residual)).min(dim=0).values
+            features = critic_features(self.decorator, self.critic_view(next_obs), batch["next_base"], residual)
+            values = self.targets(features)
+            value = (values if members is None else values[members]).min(dim=0).values
             if self.config.entropy_backup:
                 value = value - temperature * log_pi
             return batch["reward"] + batch["discount"] * value
 
-    def _update_critics(self, batch, obs, next_obs, noise, temperature) -> dict[str, torch.Tensor]:
-        target = self.td_target(batch, next_obs, noise, temperature)
+    def _update_critics(self, batch, obs, next_obs, noise, temperature, members) -> dict[str, torch.Tensor]:
+        target = self.td_target(batch, next_obs, noise, temperature, members)
         with autocast(self.device, self.config.bf16):
-            values = self.critics(critic_features(self.decorator, obs, batch["base"], batch["residual"]))
+            values = self.critics(critic_features(self.decorator, self.critic_view(obs), batch["base"], batch["residual"]))
             loss = F.mse_loss(values, target.expand_as(values), reduction="none").mean(dim=1).sum()
         self.critic_optimizer.zero_grad(set_to_none=True)
         loss.backward()
@@ -123,12 +148,14 @@ class SAC:
         self.critics.requires_grad_(False)  # their weights' gradients would be thrown away
         with autocast(self.device, self.config.bf16):
             residual, log_pi = self.actor.sample(actor_features(self.decorator, obs, batch["base"]), noise)
-            value = self.critics(critic_features(self.decorator, obs, batch["base"], residual)).min(dim=0).values
+            values = self.critics(critic_features(self.decorator, self.critic_view(obs), batch["base"], residual))
+            value = values.mean(dim=0) if self.config.actor_value == "mean" else values.min(dim=0).values
             loss = (temperature * log_pi - value).mean() + self.config.residual_penalty * residual.square().mean()
-        self.actor_optimizer.zero_grad(set_to_none=True)
-        loss.backward()
-        torch.nn.utils.clip_grad_norm_(self.actor.parameters(), self.config.grad_clip)
-        self.actor_optimizer.step()
+        if self.updates >= self.config.critic_warmup:
+            self.actor_optimizer.zero_grad(set_to_none=True)
+            loss.backward()
+            torch.nn.utils.clip_grad_norm_(self.actor.parameters(), self.config.grad_clip)
+            self.actor_optimizer.step()
         self.critics.requires_grad_(True)
         with torch.no_grad():
             if self.config.average:

@@ -1,0 +1,41 @@
+"""From a method's name to its configuration, its starting policy and its trainer."""
+from __future__ import annotations
+
+import importlib
+from pathlib import Path
+from typing import Any
+
+from ..demos import Demos
+from ..errors import unknown
+from ..files import DATA
+from ..online import Trainer
+from ..online_config import OnlineConfig
+from ..policies import Policy
+from ..profiles import online_config
+from ..tasks.spec import TaskSpec
+from . import METHODS, Method
+
+
+def get_method(name: str) -> Method:
+    """The method of this name. Raises PdkitError for an unknown one."""
+    if name not in METHODS:
+        raise unknown("method", name, METHODS)
+    return METHODS[name]
+
+
+def method_config(method: str, task: str, profile: str = "lesson", seed: int = 0, /, **changes: Any) -> OnlineConfig:
+    """The configuration of a method on a task: the task's profile, then the method's changes, then `changes` (flat names)."""
+    m = get_method(method)
+    own = m.changes | {"lesson": m.lesson, "smoke": m.lesson, "paper": m.paper}.get(profile, {})
+    return online_config(task, profile, seed, **({"method": method} | own | changes))
+
+
+def base_folder(method: str, task: str) -> Path:
+    """Where the shipped policy lies that a method starts from."""
+    return DATA / "checkpoints" / task / get_method(method).base
+
+
+def make_trainer(config: OnlineConfig, base: Policy, demos: Demos | None = None, spec: TaskSpec | None = None) -> Trainer:
+    """The trainer of the method named in `config`."""
+    module, name = get_method(config.method).trainer.split(":")
+    return getattr(importlib.import_module(module), name)(config, base, demos, spec)

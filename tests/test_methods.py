@@ -1,0 +1,148 @@
+"""Methods: what each changes in the loop, and that it learns."""
+import numpy as np
+import pytest
+import torch
+from test_probes import SMALL, success
+from worlds import clone, reach_demos
+
+from pdkit.decorator import DecoratorConfig
+from pdkit.errors import PdkitError
+from pdkit.methods import METHODS
+from pdkit.methods.config import MethodConfig
+from pdkit.methods.finetune import FineTune
+from pdkit.methods.registry import make_trainer, method_config
+from pdkit.online import Trainer
+from pdkit.online_config import OnlineConfig
+from pdkit.policies import BeT, BeTForSAC, load_policy, save_policy
+from pdkit.probes import PROBES, biased_base
+
+TINY = dict(window=3, bins=4, layers=1, heads=2, embed=16, features=16, dropout=0.0)
+
+
+def run(method, base, demos=None, sac=SMALL, own=None, **changes):
+    """A method's own configuration on the reach probe, at a scale of seconds."""
+    m = METHODS[method].changes
+    values = dict(task="reach", method=method, total_steps=3000, num_envs=4, env_workers=0, warmup_steps=500, utd=0.5, batch=64, n_step=3,
+                  on_success="terminate", success_tail=0, gamma=0.9, eval_every=0, log_every=0, checkpoint_every=0, demo_fraction=0.25)
+    loop = {k: v for k, v in m.items() if k in OnlineConfig.__dataclass_fields__}
+    parts = {k: v for k, v in m.items() if k in sac.__dataclass_fields__}
+    decorator = DecoratorConfig(**{k: v for k, v in m.items() if k in DecoratorConfig.__dataclass_fields__})
+    config = OnlineConfig(**(values | loop | changes), sac=type(sac)(**(vars(sac) | parts)), decorator=decorator,
+                          method_config=own or MethodConfig())
+    trainer = make_trainer(config, base, demos if config.demo_fraction else None, PROBES["reach"])
+    return trainer, trainer.train()
+
+
+@pytest.fixture(scope="module")
+def bet_sac():
+    """A bet-sac policy that aims beside the goal, as the biased base does."""
+    return clone(BeTForSAC, reach_demos(20, aim=(0.2, -0.2)), TINY | dict(scale=[0.5, 0.5]))
+
+
+# ---- the modified Behavior Transformer -------------------------------------------------------------------------------
+
+def test_the_modified_bet_imitates_like_the_original(bet_sac):
+    demos = reach_demos(30)
+    rates = [success("reach", clone(cls, demos, TINY | extra)) for cls, extra in ((BeT, {}), (BeTForSAC, dict(scale=[0.5, 0.5])))]
+    assert min(rates) > 0.9
+    assert success("reach", clone(BeTForSAC, demos, TINY)) < 0.7  # why there is a scale: full actions lie at atanh's poles
+    assert success("reach", bet_sac) < 0.5
+
+
+def test_offsets_live_before_the_tanh():
+    """a = tanh(atanh(scale * bin) + offset) / scale, by hand, and its inverse in the loss."""
+    policy = BeTForSAC({"obs_dim": 4, "act_dim": 2, **TINY, "bins": 2, "scale": [0.3, 1.0]}).eval()
+    policy.centres.copy_(torch.tensor([[1.0, -0.5], [1.0, -0.5]]))
+    torch.nn.init.zeros_(policy.regression.weight)
+    policy.regression.bias.data = torch.tensor([0.1, 0.2, 0.1, 0.2])
+    action = policy(torch.zeros(1, 3, 4))[0, 0].detach().numpy()
+    expected = np.tanh(np.arctanh(np.array([0.3, -0.5])) + [0.1, 0.2]) / [0.3, 1.0]
+    assert np.allclose(action, expected, atol=1e-5) and action[0] > 1  # the environment clips
+    terms = policy.loss(torch.zeros(1, 3, 4), torch.from_numpy(expected.astype(np.float32)).expand(1, 3, 2))
+    assert terms["offset_mse"].item() == pytest.approx(0, abs=1e-6)
+
+
+def test_log_probability_is_that_of_the_squashed_gaussian(bet_sac):
+    stored, noise = torch.randn(5, 12), torch.randn(5, 2)
+    action, log_pi = bet_sac.sample(stored, noise)
+    mean, log_std = bet_sac.gaussian(stored.view(5, 3, 4))
+    normal = torch.distributions.Normal(mean, log_std.exp())
+    squashed = torch.distributions.TransformedDistribution(normal, torch.distributions.TanhTransform(cache_size=1))
+    assert torch.allclose(squashed.log_prob(action * 0.5).sum(-1), log_pi, atol=1e-3)
+    assert torch.allclose(bet_sac.mean_action(stored), bet_sac(stored.view(5, 3, 4))[:, 0])
+
+
+def test_lora_starts_as_the_policy_and_trains_little(bet_sac, tmp_path):
+    adapted, stored = bet_sac.with_lora(2), torch.randn(5, 12)
+    assert torch.allclose(adapted.mean_action(stored), bet_sac.mean_action(stored), atol=1e-6)
+    trained = {n for n, p in adapted.named_parameters() if p.requires_grad}
+    assert trained and all("lora_" in n or n.startswith("spread.") for n in trained)
+    assert {n.split(".lora")[0] for n in trained if "lora_" in n} == {"gpt.blocks.0.qkv", "gpt.blocks.0.proj", "regression"}
+    with torch.no_grad():
+        next(p for n, p in adapted.named_parameters() if "regression.lora_B" in n).fill_(0.1)
+    save_policy(adapted, tmp_path / "p")
+    again = load_policy(tmp_path / "p")
+    assert torch.allclose(again.mean_action(stored), adapted.mean_action(stored))
+    assert not torch.allclose(again.mean_action(stored), bet_sac.mean_action(stored), atol=1e-3)
+
+
+def test_scale_is_checked():
+    with pytest.raises(PdkitError, match="factors in"):
+        BeTForSAC({"obs_dim": 4, "act_dim": 2, **TINY, "scale": [0.5]})
+
+
+# ---- methods on the shared loop --------------------------------------------------------------------------------------
+
+@pytest.mark.parametrize("method", METHODS)
+def test_every_method_has_a_configuration_in_every_profile(method):
+    for profile in ("smoke", "lesson", "paper"):
+        assert method_config(method, "Door", profile).method == method
+    assert METHODS[method].source and METHODS[method].title
+
+
+def test_fine_tuning_learns_and_leaves_the_start_alone(bet_sac):
+    before = {k: v.clone() for k, v in bet_sac.state_dict().items()}
+    trainer, policy = run("sac_finetune", bet_sac, total_steps=4000)
+    assert isinstance(trainer, FineTune) and trainer.demos is None
+    assert success("reach", policy) > success("reach", bet_sac) + 0.3
+    assert all(torch.equal(v, before[k]) for k, v in bet_sac.state_dict().items())
+
+
+def test_fine_tuning_stores_windows_and_shows_critics_the_last_observation(bet_sac):
+    trainer, _ = run("sac_finetune", bet_sac, total_steps=700, utd=0.0)
+    rows = trainer.replay.unpack(trainer.replay.rows[: trainer.replay.size])
+    windows = rows["obs"].view(-1, 3, 4)
+    assert (windows[:, :, 2:] == windows[:, -1:, 2:]).all()  # the goal does not move within an episode
+    assert (windows[:, 1:, :2] != windows[:, :-1, :2]).any() and (rows["base"] == 0).all()
+    assert torch.allclose(trainer.agent.critic_view(rows["obs"]), bet_sac.normalizer(windows[:, -1]))
+
+
+def test_fine_tuning_wants_a_policy_it_can_tune():
+    with pytest.raises(PdkitError, match="bet-sac"):
+        run("sac_finetune", biased_base())
+
+
+def test_residual_rl_is_the_decorator_without_bound_and_schedule():
+    config = method_config("residual_rl", "Door")
+    assert (config.decorator.alpha, config.decorator.H, config.warmup) == (1.0, 0, "uniform")
+    trainer, policy = run("residual_rl", biased_base(), reach_demos(), total_steps=4000)
+    assert type(trainer) is Trainer and success("reach", policy) > 0.9
+
+
+@pytest.mark.parametrize(("method", "steps"), [("sac_from_scratch", 6000), ("rlpd", 3000)])
+def test_from_scratch_nothing_of_the_base_is_used(method, steps):
+    trainer, policy = run(method, biased_base(), reach_demos(), total_steps=steps, warmup_steps=1000)
+    rows = trainer.replay.unpack(trainer.replay.rows[: trainer.replay.size])
+    assert (rows["base"] == 0).all() and success("reach", policy) > 0.9
+
+
+@pytest.mark.parametrize("method", ["rlpd", "rlpd_paper"])
+def test_symmetric_sampling_takes_half_of_each_batch_from_demonstrations(method, monkeypatch, bet_sac):
+    from pdkit.rl.replay import Replay
+
+    drawn = []
+    draw = Replay.draw
+    monkeypatch.setattr(Replay, "draw", lambda self, count, generator: drawn.append((self, count)) or draw(self, count, generator))
+    trainer, _ = run(method, bet_sac, reach_demos(), total_steps=600, warmup_steps=500, utd=0.1)
+    sizes = {"replay": {n for who, n in drawn if who is trainer.replay}, "demos": {n for who, n in drawn if who is trainer.demos}}
+    assert sizes == {"replay": {32}, "demos": {32}}

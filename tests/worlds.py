@@ -1,0 +1,42 @@
+"""What several test modules build probes' policies and demonstrations with."""
+import numpy as np
+import torch
+
+from pdkit.demos import Demos
+from pdkit.probes import PROBES
+
+
+def reach_demos(num=20, aim=(0.0, 0.0), first_seed=0):
+    """Demonstrations of the reach probe by the controller that goes straight to the goal, missed by `aim`; until solved or over."""
+    spec, episodes = PROBES["reach"], []
+    for seed in range(first_seed, first_seed + num):
+        sim = spec.make()
+        observations, actions, success = [sim.reset(seed)], [], []
+        while len(actions) < spec.max_episode_steps and not any(success):
+            o = observations[-1]
+            actions.append(np.clip((o[2:] + np.array(aim) - o[:2]) * 2.5, -1, 1).astype(np.float32))
+            o, solved = sim.step(actions[-1])
+            observations.append(o)
+            success.append(solved)
+        episodes.append((np.stack(observations), np.stack(actions), np.array(success), seed))
+    observations, actions, success, seeds = zip(*episodes, strict=True)  # not from_episodes: the registry does not know probes
+    return Demos("reach", "scripted", "test", "-", np.concatenate(observations), np.concatenate(actions), np.concatenate(success),
+                 np.array([len(a) for a in actions]), np.array(seeds))
+
+
+def clone(kind, demos, config, iterations=300, lr=3e-3, seed=0):
+    """A policy class trained on demonstrations of a probe, whole trajectories cut into windows."""
+    from pdkit.imitate import Windows
+
+    torch.manual_seed(seed)
+    policy = kind({"obs_dim": 4, "act_dim": 2} | config)
+    policy.fit_statistics(demos.observations, demos.actions)
+    windows, generator = Windows(demos, policy.window, True), torch.Generator().manual_seed(seed)
+    optimizer = torch.optim.Adam(policy.parameters(), lr=lr)
+    policy.train()
+    for _ in range(iterations):
+        loss = policy.loss(*windows.sample(64, generator))["loss"]
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    return policy.eval()
