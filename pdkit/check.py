@@ -97,3 +97,44 @@ def gate(answer: Callable, strict: bool = False) -> bool:
             yield "beyond H something is still off; the probability stops at 1."
 
     return _judge("gate", complaints, strict)
+
+
+def cosines(answer: Callable, strict: bool = False) -> bool:
+    """06: the cosine between rows of two arrays (N, d), 0 where a row is zero."""
+    def complaints() -> Iterator[str]:
+        rng = np.random.default_rng(0)
+        first, second = rng.standard_normal((2, 6, 4))
+        expected = [a @ b / np.sqrt(a @ a * (b @ b)) for a, b in zip(first, second, strict=True)]
+        got = np.asarray(answer(first, second))
+        if got.shape != (6,):
+            yield f"it gives an array of shape {got.shape}, not (6,): sum over the last axis only."
+        if np.allclose(got, (first * second).sum(axis=1)):
+            yield "it is the dot product: where is the division by both norms?"
+        if not np.allclose(got, expected):
+            yield f"the first cosine is {got[0]:.3f}, not {expected[0]:.3f}."
+        first[2] = 0
+        got = np.asarray(answer(first, second))
+        if not np.isfinite(got).all() or got[2] != 0:
+            yield f"for a row of zeros it gives {got[2]}, not 0."
+
+    return _judge("cosines", complaints, strict)
+
+
+def temperature_step(answer: Callable, strict: bool = False) -> bool:
+    """07: log temperature after one step of plain gradient descent on log_temperature * (entropy - target)."""
+    def complaints() -> Iterator[str]:
+        for log_temperature, entropy, target in ((0.0, -40.0, -28.0), (-4.6, 3.0, -28.0)):
+            got = float(answer(log_temperature, entropy, target, 1e-3))
+            expected = log_temperature - 1e-3 * (entropy - target)
+            if abs(got - expected) < 1e-9:
+                continue
+            if abs(got - (log_temperature + 1e-3 * (entropy - target))) < 1e-9:
+                yield "the sign is wrong: an actor that is too sure of itself must be paid more for entropy, not less."
+            elif abs(got - (log_temperature - 1e-3 * log_temperature * (entropy - target))) < 1e-9:
+                yield "the gradient of x * c is c, not x * c."
+            elif abs(got - (log_temperature - 1e-3 * (entropy + target))) < 1e-9:
+                yield "the target is negative already: subtract it."
+            else:
+                yield f"from {log_temperature:g} with entropy {entropy:g} it gives {got:.4f}, not {expected:.4f}."
+
+    return _judge("temperature_step", complaints, strict)

@@ -24,6 +24,8 @@ VERBS = {  # verb: (what it does, the function that does it, given the remaining
     "demos": ("make demonstrations of a task, or look at them", "pdkit.demos.cli:main"),
     "train": ("train a base policy or a decorated one", "pdkit.train:main"),
     "nb": ("run a notebook without a browser, with other parameters", "pdkit.nb:main"),
+    "sweep": ("run a grid of trainings or notebooks, two at a time or on Ray", "pdkit.sweep:main"),
+    "report": ("list the paper's claims with what was measured", "pdkit.report:main"),
     "bench": ("measure speed on this machine", "pdkit.bench:main"),
 }
 

@@ -11,7 +11,13 @@ from .tasks.lanes import IDLE
 from .tasks.spec import TaskSpec
 from .tasks.vector import VectorEnv
 
-Actor = Callable[[np.ndarray], np.ndarray]  # windows (N, window, obs_dim) -> action chunks (N, chunk, act_dim)
+Actor = Callable[..., np.ndarray]  # windows (N, window, obs_dim) -> action chunks (N, chunk, act_dim)
+
+
+def timed(act: Actor) -> Actor:
+    """Marks an `act` that depends on the time: it is also given the steps since each episode's start, (N,) int64."""
+    act.timed = True
+    return act
 
 
 def evaluate(spec: TaskSpec, actor: Actor, seeds: Sequence[int], *, window: int = 1, chunk: int = 1, num_envs: int = 10,
@@ -28,12 +34,13 @@ def evaluate(spec: TaskSpec, actor: Actor, seeds: Sequence[int], *, window: int 
     queue = list(seeds)[::-1]
     num_envs = min(num_envs, len(queue))
     rows: dict[int, dict] = {}
+    elapsed = np.zeros(num_envs, np.int64)
     with VectorEnv(spec, num_envs, lambda lane: queue.pop() if queue else IDLE, window=window, chunk=chunk, workers=workers,
                    max_episode_steps=max_episode_steps) as envs:
         windows = envs.reset()
         while len(rows) < len(seeds):
-            result = envs.step(actor(windows))
-            windows = result.windows
+            result = envs.step(actor(windows, elapsed) if getattr(actor, "timed", False) else actor(windows))
+            windows, elapsed = result.windows, np.where(result.done, 0, elapsed + result.steps)
             for e in result.episodes:
                 rows[e.seed] = dict(seed=e.seed, success_once=e.success_once, success_at_end=e.success_at_end, length=e.length)
             if result.episodes and progress:

@@ -15,6 +15,7 @@ from .evaluate import evaluate
 from .policies import POLICIES, Policy
 from .seeds import selection_seeds
 from .tasks import get_task
+from .tasks.spec import TaskSpec
 from .torch_setup import autocast
 
 
@@ -58,6 +59,11 @@ class Windows:
         self.index = torch.tensor(np.array(index))
         self.span = torch.arange(window)
 
+    def all(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Every window (N, window, obs_dim), and the action (N, act_dim) taken at its last observation."""
+        rows = self.index[:, None] + self.span
+        return self.observations[rows], self.actions[rows[:, -1]]
+
     def sample(self, batch: int, generator: torch.Generator) -> tuple[torch.Tensor, torch.Tensor]:
         """(B, window, obs_dim) and (B, window, act_dim)."""
         start = self.index[torch.randint(len(self.index), (batch,), generator=generator)]
@@ -70,16 +76,24 @@ def imitate(kind: str, demos: Demos, config: ImitateConfig | None = None, policy
     """Train a policy of `kind` on `demos`.
 
     Returns the selected policy in evaluation mode, and one row per checkpoint: iteration, loss terms, seconds and, when
-    evaluated, success_once and success_at_end on the selection seeds.
+    evaluated, success_once and success_at_end on the selection seeds. A policy without gradient steps, such as VINN, is only
+    given the demonstrations: it has a single row, of iteration 0, and of `config` only the evaluation and the windows matter.
     """
     config = config or ImitateConfig()
     spec = get_task(demos.task)
     torch.manual_seed(config.seed)
     generator = torch.Generator().manual_seed(config.seed)
-    policy = POLICIES[kind]({"obs_dim": spec.obs_dim, "act_dim": spec.act_dim, **(policy_config or {})})
+    policy = POLICIES[kind]({"obs_dim": spec.obs_dim, "act_dim": spec.act_dim, **POLICIES[kind].for_task(spec), **(policy_config or {})})
     policy.fit_statistics(demos.observations, demos.actions, config.seed)
     policy.to(device).train()
     windows = Windows(demos, policy.window, config.pad_start)
+    if not policy.learns:
+        started = time.monotonic()
+        policy.remember(*windows.all())
+        row = {"iteration": 0, "seconds": time.monotonic() - started} | _scores(spec, policy, config)
+        if progress:
+            progress(row)
+        return policy.eval(), [row]
     optimizer = torch.optim.AdamW(policy.parameter_groups(config.weight_decay), lr=config.lr, fused=True)
     history, best, best_state, started = [], -1.0, None, time.monotonic()
     for iteration in range(1, config.iterations + 1):
@@ -96,10 +110,7 @@ def imitate(kind: str, demos: Demos, config: ImitateConfig | None = None, policy
             raise PdkitError(f"The imitation loss became {row['loss']} at iteration {iteration}; lower lr (now {config.lr}).")
         score = float(iteration)  # without evaluations the latest wins
         if config.eval_episodes:
-            policy.eval()
-            policy.reset(config.seed)
-            table = evaluate(spec, policy.act, selection_seeds(config.eval_episodes), window=policy.window, chunk=policy.chunk)
-            row |= {"success_once": float(table.success_once.mean()), "success_at_end": float(table.success_at_end.mean())}
+            row |= _scores(spec, policy.eval(), config)
             score = row["success_once"]
             policy.train()
         if score > best:
@@ -109,3 +120,12 @@ def imitate(kind: str, demos: Demos, config: ImitateConfig | None = None, policy
             progress(row)
     policy.load_state_dict(best_state)
     return policy.eval(), history
+
+
+def _scores(spec: TaskSpec, policy: Policy, config: ImitateConfig) -> dict[str, float]:
+    """Success on the selection seeds; nothing without episodes."""
+    if not config.eval_episodes:
+        return {}
+    policy.reset(config.seed)
+    table = evaluate(spec, policy.act, selection_seeds(config.eval_episodes), window=policy.window, chunk=policy.chunk)
+    return {"success_once": float(table.success_once.mean()), "success_at_end": float(table.success_at_end.mean())}

@@ -31,7 +31,8 @@ TRAINING = "training"  # the run folder of the training, inside the job's folder
 def expected_minutes(config: OnlineConfig, episodes: int) -> float:
     """Minutes that training and the two final evaluations of `episodes` take: a rough guide for two recent cores."""
     size = config.batch / 256 * config.sac.hidden / 256 * config.sac.layers / 3
-    an_update = SECONDS_AN_UPDATE * max(size, 0.1) * (1 if config.sac.bf16 else 1.4)
+    critics = 1 + 3 / 8 * (config.sac.num_critics - 2)  # ten cost four times two
+    an_update = SECONDS_AN_UPDATE * max(size, 0.1) * critics * (1 if config.sac.bf16 else 1.4)
     updates = config.utd * (config.total_steps - config.warmup_steps)
     during = 0 if config.eval_workers or not config.eval_every else config.eval_episodes * config.total_steps // config.eval_every
     evaluated = during + 2 * episodes

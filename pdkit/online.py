@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import copy
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -16,11 +16,12 @@ import torch
 from torch import nn
 
 from .decorated import Decorated, save_decorated
-from .decorator import compose, gate, gate_probability, scaled
+from .decorator import compose, gate, gate_probability
 from .demos.format import Demos
 from .errors import PdkitError
-from .online_config import OnlineConfig, stops
+from .online_config import OnlineConfig, lr_factor, stops
 from .online_eval import Evaluations
+from .online_rows import demo_rows, last_observation
 from .policies import Policy
 from .rl.replay import NStep, Replay
 from .rl.sac import SAC
@@ -30,36 +31,6 @@ from .tasks import get_task
 from .tasks.spec import TaskSpec
 from .tasks.vector import Episode, VectorEnv
 from .torch_setup import pick_device
-
-
-def last_observation(windows: np.ndarray) -> np.ndarray:
-    """What most methods store of windows (N, window, obs_dim): the latest observations (N, obs_dim)."""
-    return windows[:, -1]
-
-
-def demo_rows(demos: Demos, base: Policy, config: OnlineConfig,
-              view: Callable[[np.ndarray], np.ndarray] = last_observation) -> list[np.ndarray]:
-    """Demonstrations as replay rows: the residual stored is the one that makes the executed action the demonstrated one.
-
-    An episode ends as training episodes do: at its first success with on_success="terminate", else at its own end, as a
-    time limit (the value of its last state counts).
-    """
-    steps, rows = NStep(1, config.n_step, config.gamma), []
-    for episode in demos.episodes():
-        observations, actions, success = episode["observations"], episode["actions"], episode["success"]
-        length = len(actions)
-        if config.on_success == "terminate" and success.any():
-            length = int(np.argmax(success)) + 1
-        padded = np.concatenate([np.repeat(observations[:1], base.window - 1, axis=0), observations])
-        windows = np.lib.stride_tricks.sliding_window_view(padded, base.window, axis=0).transpose(0, 2, 1)[: length + 1]
-        bases, seen = base.act(windows)[:, 0], view(windows)
-        residuals = (actions[:length] - bases[:length]) / np.maximum(scaled(config.decorator, np.ones_like(bases[:length])), 1e-6)
-        for t in range(length):
-            last = t == length - 1
-            terminated = last and config.on_success == "terminate" and bool(success[t])
-            rows += steps.push(0, seen[t], residuals[t], bases[t], float(success[t]) + config.reward_shift, seen[t + 1],
-                               bases[t + 1], stops(config, terminated, last and not terminated), last)
-    return rows
 
 
 class Trainer:
@@ -78,16 +49,15 @@ class Trainer:
         self.rng = np.random.default_rng([config.seed, 1])
         self.generator = torch.Generator().manual_seed(config.seed)
         self.agent = self._make_agent()
-        dims = (self.stored_dim, self.spec.act_dim)
-        self.replay = Replay(config.total_steps, *dims, device=config.device)
+        self.replay = self._make_replay(config.total_steps)
         self.demos = None
-        if demos is not None and config.demo_fraction:
-            rows = demo_rows(demos, base, config, self._view)
-            self.demos = Replay(len(rows), *dims, device=config.device)
+        if demos is not None and (config.demo_fraction or self.needs_demos):
+            rows = self._demo_rows(demos)
+            self.demos = self._make_replay(len(rows))
             self.demos.add(rows)
         elif config.demo_fraction:
             raise PdkitError("demo_fraction is above 0 but no demonstrations were given; pass demos or set demo_fraction=0.")
-        self.nstep = NStep(config.num_envs, config.n_step, config.gamma)
+        self.nstep = self._make_nstep(config.num_envs)
         self.step, self.train_seconds, self.rows, self.recent = 0, 0.0, [], []
         self.episode_counts = [0] * config.num_envs
         self.log: dict[str, torch.Tensor] = {}
@@ -107,6 +77,22 @@ class Trainer:
         c = self.config
         return SAC(self.spec.obs_dim, self.spec.act_dim, c.sac, c.decorator, device=c.device,
                    normalize=self.base.normalizer if c.normalize_obs else None)
+
+    def _make_replay(self, capacity: int) -> Replay:
+        return Replay(capacity, self.stored_dim, self.spec.act_dim, device=self.config.device)
+
+    def _make_nstep(self, lanes: int) -> NStep:
+        return NStep(lanes, self.config.n_step, self.config.gamma)
+
+    def _demo_rows(self, demos: Demos) -> list[np.ndarray]:
+        return demo_rows(demos, self.base, self.config, self._view)
+
+    needs_demos = False  # even when none are mixed into batches
+    offline_updates = 0  # made by `_offline`; those of the loop come on top
+
+    def _offline(self, evaluations: Evaluations) -> Iterator[None]:
+        """Learning from data before the first step, or what remains of it; each yield is a row, and a moment to checkpoint."""
+        yield from ()
 
     def _as_policy(self, actor: nn.Module, base: Policy) -> Decorated | Policy:
         """What is evaluated and reported: this actor as a policy."""
@@ -152,6 +138,15 @@ class Trainer:
             windows, base = self._start(envs, run)
             for step, weights in sorted(self._unscored.items()):
                 evaluations.submit(step, weights)
+            started = time.monotonic()
+            for _ in self._offline(evaluations):
+                self.train_seconds += time.monotonic() - started
+                self.rows.append(self._row())
+                if progress:
+                    progress(self)
+                if run is not None:
+                    self.save(run, envs.snapshot() | {"base": base}, evaluations.pending)
+                started = time.monotonic()
             while self.step < c.total_steps:
                 started = time.monotonic()
                 before = self.step
@@ -205,10 +200,9 @@ class Trainer:
 
     def _learn(self) -> None:
         c = self.config
-        due = int((self.step - c.warmup_steps) * c.utd) - self.agent.updates
+        due = int((self.step - c.warmup_steps) * c.utd) + self.offline_updates - self.agent.updates
         if due > 0 and self.replay.size >= c.batch and c.lr_decay_from < 1:
-            done = (self.step / c.total_steps - c.lr_decay_from) / (1 - c.lr_decay_from)
-            self.agent.scale_lr(1 - 0.9 * min(max(done, 0.0), 1.0))
+            self.agent.scale_lr(lr_factor(c, self.step))
         for _ in range(max(0, due) if self.replay.size >= c.batch else 0):
             demos = round(c.batch * c.demo_fraction) if self.demos else 0
             rows = self.replay.draw(c.batch - demos, self.generator)
@@ -247,9 +241,11 @@ class Trainer:
     def _collect(self, evaluations: Evaluations, progress, wait: bool = False) -> None:
         """Enter what has been evaluated into its row, and keep the best actor since the gate was open."""
         for step, weights, scores in evaluations.collect(wait):
-            next(row for row in self.rows if row["step"] == step).update(scores)
-            score = (scores["success_once"] + scores["success_at_end"]) / 2
-            if self.config.select == "best" and step >= self.config.decorator.H and score >= self.best_score:
+            next(row for row in reversed(self.rows) if row["step"] == step).update(scores)
+            score = scores["success_once"]
+            if self.config.on_success == "continue":  # then staying solved is learned too
+                score = (score + scores["success_at_end"]) / 2
+            if self.config.select == "best" and step >= max(self.config.decorator.H, 1) and score >= self.best_score:
                 self.best_score, self.best_actor = score, weights
             if progress:
                 progress(self)

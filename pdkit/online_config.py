@@ -40,7 +40,7 @@ class OnlineConfig:
     eval_every: int = 7_500
     eval_episodes: int = 50  # on selection seeds
     eval_workers: int = 1  # 1: evaluations run in a process of their own while this one learns; results do not depend on it
-    select: str = "best"  # the result: the last policy, or the best evaluated one since the gate was open (mean of both success rates)
+    select: str = "best"  # the result: the last policy, or the best evaluated one since the gate was open (see Trainer._collect)
     log_every: int = 2_500
     checkpoint_every: int = 15_000
     device: str = "cpu"
@@ -68,3 +68,11 @@ class OnlineConfig:
 def stops(config: OnlineConfig, terminated: bool, truncated: bool) -> bool:
     """Whether the value of s' is left out of the target at this transition."""
     return {"truncated": terminated, "never": terminated or truncated, "always": False}[config.bootstrap]
+
+
+def lr_factor(config: OnlineConfig, step: int) -> float:
+    """What the learning rates are multiplied by at environment step `step`: 1, then falling linearly to a tenth at the end."""
+    if config.lr_decay_from >= 1:
+        return 1.0
+    done = (step / config.total_steps - config.lr_decay_from) / (1 - config.lr_decay_from)
+    return 1 - 0.9 * min(max(done, 0.0), 1.0)

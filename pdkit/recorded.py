@@ -20,16 +20,23 @@ KEYS = ["task", "recipe", "seed"]  # a row with the same ones is replaced
 
 
 def record(name: str, rows: pd.DataFrame, curves: pd.DataFrame) -> None:
-    """Add rows to data/results/NAME.csv and NAME_curves.csv, and draw NAME.png anew."""
-    folder = DATA / "results"
-    tables = []
+    """Add rows to data/results/NAME.csv and, where there are curves, NAME_curves.csv, and draw NAME.png of trainings anew.
+
+    The manifest tells how to make all of it again: the column `sweep` of rows that have one, else `command`.
+    """
+    folder, tables = DATA / "results", []
     with _alone(name):
         for path, new in ((folder / f"{name}.csv", rows), (folder / f"{name}_curves.csv", curves)):
+            if new.empty:
+                continue
             tables.append(_merged(path, new))
             with atomic_file(path) as temporary:
                 tables[-1].to_csv(temporary, index=False, float_format="%.6g")
+        again = tables[0]["sweep"].fillna(tables[0].command) if "sweep" in tables[0] else tables[0].command
         write_json(folder / f"{name}_manifest.json", {"written": time.strftime("%Y-%m-%d"), "machine": describe_machine(),
-                                                     "again": sorted(set(tables[0].command))})
+                                                     "again": sorted(set(again))})
+        if len(tables) < 2 or not {"base_success", "decorated_success"} <= set(tables[0]):
+            return
         with atomic_file(folder / f"{name}.png") as temporary:
             figure(*tables, "Door" if "Door" in set(tables[0].task) else str(rows.task.iloc[0])).savefig(temporary, dpi=130)
 
@@ -55,31 +62,44 @@ def _merged(path: Path, new: pd.DataFrame) -> pd.DataFrame:
 def figure(table: pd.DataFrame, curves: pd.DataFrame, task: str = "Door") -> Figure:
     """Left: evaluations on selection seeds during training, a line a run. Right: success on the test seeds, with intervals.
 
-    Runs are named by their recipe where there are several recipes, by their seed otherwise.
+    Runs are named by their recipe where there are several recipes, by their seed otherwise; several recipes with several seeds
+    are a line a recipe (the mean), and a bar with a dot a seed.
     """
     table, curves = table[table.task == task], curves[curves.task == task]
-    several = table.recipe.nunique() > 1
-    fig, (left, right) = plt.subplots(1, 2, figsize=(10, 4.4 if several else 3.6), width_ratios=(3, 2), layout="constrained")
+    recipes, several = list(dict.fromkeys(table.recipe)), table.recipe.nunique() > 1
+    means = several and len(table) > len(recipes)
+    height = max(4.4 if several else 3.6, 0.22 * (len(recipes) if means else len(table)))
+    fig, (left, right) = plt.subplots(1, 2, figsize=(10, height), width_ratios=(3, 2), layout="constrained")
     colors = plt.get_cmap("tab20" if several else "tab10")
-    bars = [("base", table.base_success.iloc[0], "0.65")]  # the first row's; a recipe with another base policy is named so
-    for i, row in enumerate(table.itertuples()):
-        name, color = (f"{row.recipe}, seed {row.seed}" if several else f"seed {row.seed}"), colors(i % colors.N)
-        curve = curves[(curves.recipe == row.recipe) & (curves.seed == row.seed)].dropna(subset=["success_once"])
+    base = table.base_success.iloc[0]  # the first row's; a recipe with another base policy is named so
+    bars = [("base", [base], "0.65")]
+    groups = [(r, r, table[table.recipe == r]) for r in recipes] if means else \
+        [(f"{r.recipe}, seed {r.seed}" if several else f"seed {r.seed}", r.recipe, table.loc[[i]]) for i, r in table.iterrows()]
+    for i, (name, recipe, rows) in enumerate(groups):
+        color = colors(i % colors.N)
+        curve = curves[(curves.recipe == recipe) & curves.seed.isin(rows.seed)].dropna(subset=["success_once"])
+        # Seeds are logged a few steps apart: the n-th evaluations belong together.
+        curve = curve.assign(number=curve.groupby("seed").cumcount()).groupby("number")[["step", "success_once"]].mean()
         left.plot(curve.step / 1000, 100 * curve.success_once, "-o", ms=3, lw=1.2, color=color, label=name)
-        bars.append((name, row.decorated_success, color if several else "#2c9f6b"))
-    left.axhline(100 * table.base_success.iloc[0], color="0.4", ls="--", lw=1, label="base policy")
+        bars.append((name, list(rows.decorated_success), color if several else "#2c9f6b"))
+    left.axhline(100 * base, color="0.4", ls="--", lw=1, label="base policy")
     left.set(xlabel="environment steps (thousands)", ylabel="success within the episode (%)", ylim=(0, 102),
              title=f"{task}: evaluations during training")
     if not several:
         left.legend(fontsize=8, loc="lower right")
     count = int(table.episodes.iloc[0])
-    for y, (_, value, color) in enumerate(reversed(bars)):
-        rate = wilson(round(value * count), count)
+    for y, (name, values, color) in enumerate(reversed(bars)):
+        value = sum(values) / len(values)
         right.barh(y, 100 * value, color=color)
-        right.errorbar(100 * value, y, xerr=[[100 * (value - rate.low)], [100 * (rate.high - value)]], color="k", capsize=3, lw=1)
+        if means and name != "base":
+            right.plot([100 * v for v in values], [y] * len(values), "k.", ms=4)
+        else:
+            rate = wilson(round(value * count), count)
+            right.errorbar(100 * value, y, xerr=[[100 * (value - rate.low)], [100 * (rate.high - value)]], color="k", capsize=3, lw=1)
         right.text(3, y, f"{100 * value:.0f}", va="center", color="white", weight="bold", fontsize=8)
     right.set_yticks(range(len(bars)), [name for name, _, _ in reversed(bars)], fontsize=8)
-    right.set(xlabel="success within the episode (%)", xlim=(0, 102), title=f"{count} test episodes, 95 % intervals")
+    right.set(xlabel="success within the episode (%)", xlim=(0, 102),
+              title=f"{count} test episodes, {'mean and seeds' if means else '95 % intervals'}")
     for ax in (left, right):
         ax.spines[["top", "right"]].set_visible(False)
     plt.close(fig)

@@ -18,6 +18,10 @@ def selection_seeds(num: int) -> list[int]:
     return list(range(SELECT, SELECT + num))
 
 
+def rollout_seeds(num: int) -> list[int]:
+    return list(range(ROLLOUT, ROLLOUT + num))
+
+
 def training_seed(run_seed: int, lane: int, episode: int) -> int:
     """The seed of one training episode, well spread over [10^7, 2^31)."""
     word = np.random.SeedSequence([run_seed, lane, episode]).generate_state(1)[0]

@@ -15,12 +15,15 @@ from .cli import Parser
 from .demos import Demos, load_demos, sources
 from .errors import PdkitError, unknown
 from .evaluate import evaluate
-from .files import DATA, atomic_file, runs_root
+from .files import atomic_file, runs_root
 from .imitate import ImitateConfig, imitate
+from .methods import METHODS
+from .methods.registry import base_folder as shipped_base
+from .methods.registry import make_trainer, method_config, trainer_of
 from .online import Trainer
 from .policies import POLICIES, Policy, load_policy, save_policy
 from .policies.base import read_card
-from .profiles import PROFILES, checked, differences, flat, online_config
+from .profiles import PROFILES, checked, differences, flat
 from .recorded import record
 from .runs import Run, describe_machine, origin
 from .seeds import reported_seeds
@@ -38,17 +41,18 @@ def main(argv: list[str]) -> int:
     base.add_argument("--demos", help="demonstration file (default: the bundled one)")
     base.add_argument("--num-demos", type=int, help="use only the first so many")
     base.add_argument("--out", help="folder of the checkpoint (default runs/base/TASK-POLICY)")
-    decorated = kinds.add_parser("decorated", help="improve a base policy by online RL on sparse reward")
+    decorated = kinds.add_parser("decorated", help="improve a base policy by online RL on sparse reward, by any of the methods")
     decorated.add_argument("task")
     decorated.add_argument("--profile", default="lesson", help=f"one of: {', '.join(PROFILES)}")
-    decorated.add_argument("--base", help="folder of the base policy (default: the shipped one)")
+    decorated.add_argument("--method", default="policy_decorator", help=f"one of: {', '.join(METHODS)}")
+    decorated.add_argument("--base", help="folder of the base policy (default: the shipped one that the method starts from)")
     decorated.add_argument("--demos", help="demonstration file (default: the bundled one)")
     decorated.add_argument("--num-demos", type=int, help="use only the first so many (default: as many as the base policy saw)")
     decorated.add_argument("--seeds", type=int, nargs="+", default=[0])
     decorated.add_argument("--episodes", type=int, default=200, help="test episodes (default 200)")
     decorated.add_argument("--out", help="folder of the runs (default runs/train)")
     decorated.add_argument("--record", help="name under data/results: rows are added to NAME.csv and NAME_curves.csv")
-    decorated.add_argument("--recipe", default="lesson", help="what to call this configuration in the record")
+    decorated.add_argument("--recipe", help="what to call this configuration in the record (default: lesson, or the method)")
     decorated.add_argument("--tensorboard", action="store_true", help="also write event files to the folder of each run")
     for one in (base, decorated):
         one.add_argument("--threads", type=int, default=1)
@@ -104,19 +108,20 @@ def _base(args) -> int:
 
 def _decorated(args) -> int:
     settings = parse_settings(args.set)
-    base_folder = Path(args.base) if args.base else DATA / "checkpoints" / args.task / "base"
     get_task(args.task)
+    base_folder = Path(args.base) if args.base else shipped_base(args.method, args.task)
+    args.recipe = args.recipe or ("lesson" if args.method == "policy_decorator" else args.method)
     base_table = None
     if args.episodes < 1 or min(args.seeds) < 0:
         raise PdkitError("--episodes must be at least 1 and every seed 0 or more.")
     for seed in args.seeds:
         base = load_policy(base_folder)
-        config = online_config(args.task, args.profile, seed, **settings)
+        config = method_config(args.method, args.task, args.profile, seed, **settings)
         if args.num_demos is None:
             args.num_demos = _demos_of(base_folder)
         print(f"{args.task}, seed {seed}: " + str(differences(config, args.profile) or "the profile unchanged"), flush=True)
         out = Path(args.out or runs_root() / "train") / f"{args.task}-{args.recipe}-seed{seed}"
-        demos = base_demos(args) if config.demo_fraction else None
+        demos = base_demos(args) if config.demo_fraction or trainer_of(args.method).needs_demos else None
         started_from = origin(read_card(base_folder), demos)
         row, base_table = decorate(config, base, demos, out, args.episodes, started_from, base_table, args.tensorboard)
         row |= {"recipe": args.recipe, "command": command_of(args, seed)}
@@ -133,7 +138,8 @@ def _demos_of(folder: Path) -> int | None:
 
 def command_of(args, seed: int) -> str:
     """The command that makes one row again."""
-    parts = ["pdkit train decorated", args.task, f"--profile {args.profile}", f"--seeds {seed}", f"--recipe {args.recipe}",
+    method = [f"--method {args.method}"] if args.method != "policy_decorator" else []
+    parts = ["pdkit train decorated", args.task, *method, f"--profile {args.profile}", f"--seeds {seed}", f"--recipe {args.recipe}",
              f"--episodes {args.episodes}", f"--threads {args.threads}"]
     parts += [f"--base {args.base}"] if args.base else []
     parts += [f"--demos {args.demos}"] if args.demos else []
@@ -150,7 +156,7 @@ def decorate(config, base: Policy, demos: Demos | None, out: Path, episodes: int
     Returns one row of evidence, and the base policy's episodes: the next seed's too, so they can be passed on as `base_table`.
     """
     run = Run(out, "decorated", flat(config) | started_from)
-    trainer = Trainer(config, base, demos)
+    trainer = make_trainer(config, base, demos)
     board, shown = Board(out) if tensorboard else None, set()
 
     def show(t: Trainer) -> None:
@@ -171,11 +177,12 @@ def decorate(config, base: Policy, demos: Demos | None, out: Path, episodes: int
     for name, actor in (("base", base), ("decorated", policy)):
         if name not in tables:
             actor.reset(0)
-            tables[name] = evaluate(trainer.spec, actor.act, reported_seeds(episodes), window=base.window, num_envs=50)
+            tables[name] = evaluate(trainer.spec, actor.act, reported_seeds(episodes), window=actor.window, num_envs=50)
         with atomic_file(out / f"{name}_episodes.csv") as temporary:
             tables[name].to_csv(temporary, index=False)
-    row = dict(task=config.task, policy=base.kind, seed=config.seed, train_minutes=round(trainer.train_seconds / 60, 2),
-               cores=describe_machine()["cores"], env_steps=trainer.step, updates=trainer.agent.updates, episodes=episodes,
+    row = dict(task=config.task, method=config.method, policy=base.kind, seed=config.seed,
+               train_minutes=round(trainer.train_seconds / 60, 2), cores=describe_machine()["cores"], env_steps=trainer.step,
+               updates=trainer.agent.updates, episodes=episodes,
                base_success=round(float(tables["base"].success_once.mean()), 4),
                base_success_at_end=round(float(tables["base"].success_at_end.mean()), 4),
                decorated_success=round(float(tables["decorated"].success_once.mean()), 4),

@@ -7,7 +7,7 @@ import sys
 import nbformat
 import pytest
 
-from pdkit import check, main_job, nb
+from pdkit import check, main_job, nb, unlearning
 from pdkit.errors import PdkitError
 from pdkit.files import DATA, ROOT, read_json
 from pdkit.main_job import configured, expected_minutes
@@ -64,6 +64,24 @@ def test_policy_decorator_trains_once_and_is_reused(tmp_path):
     before = (tmp_path / "training" / "policy" / "actor.safetensors").stat().st_mtime_ns
     assert run("05", tmp_path, alpha=0.07)["success_once"] == result["success_once"]
     assert (tmp_path / "training" / "policy" / "actor.safetensors").stat().st_mtime_ns == before
+
+
+def test_unlearning(tmp_path):
+    result = run("06", tmp_path, alpha=0.05)
+    assert result["verdict"] in ("reproduced", "partly", "not") and result["updates"] == [2, 4]
+    assert set(result["drift"]) == {"random critic", "critic alone", "critic learns", "decorated"}
+    assert 0 < result["drift"]["decorated"] <= result["bound"] == 0.05
+    assert result["success"]["before"]["value"] <= 1 and result["exercise_solved"] is False
+    assert (tmp_path / "success.png").exists() and not (tmp_path / "episode.png").exists()
+
+
+def test_warm_start(tmp_path):
+    result = run("07", tmp_path)
+    assert result["verdict"] in ("reproduced", "partly", "not") and set(result["runs"]) == {"warm", "vanilla", "fixed"}
+    assert result["runs"]["fixed"]["temperature"] == pytest.approx(1)
+    growth = {arm["arm"]: arm["growth"] for arm in result["interventions"]}
+    assert growth["-9"] > 1 > growth["-1"] and result["cause"] == "side"
+    assert (tmp_path / "updates.csv").exists() and result["exercise_solved"] is False
 
 
 # ---- the main job ----------------------------------------------------------------------------------------------------
@@ -158,6 +176,13 @@ def test_exercises_accept_solutions_and_name_mistakes(capsys):
         (check.gate, lambda *a: gate(*a, opposite=True), "chance to be ON"),
         (check.gate, lambda r, s, H, g: r * min(s / H, 1), "scales"),
         (check.gate, lambda r, s, H, g: r * (g.random() < s / H), "together"),
+        (check.cosines, unlearning.cosines, "solved"),
+        (check.cosines, lambda a, b: (a * b).sum(1), "dot product"),
+        (check.cosines, lambda a, b: (a * b).sum(1) / np.sqrt((a * a).sum(1) * (b * b).sum(1)), "row of zeros"),
+        (check.cosines, lambda a, b: np.tensordot(a, b), "last axis"),
+        (check.temperature_step, lambda x, h, t, lr: x - lr * (h - t), "solved"),
+        (check.temperature_step, lambda x, h, t, lr: x + lr * (h - t), "sign"),
+        (check.temperature_step, lambda x, h, t, lr: x - lr * (h + t), "negative already"),
     ]
     for judge, answer, expected in cases:
         assert judge(answer) == (expected == "solved")

@@ -6,9 +6,9 @@ from pdkit.demos import Demos
 from pdkit.probes import PROBES
 
 
-def reach_demos(num=20, aim=(0.0, 0.0), first_seed=0):
+def reach_demos(num=20, aim=(0.0, 0.0), first_seed=0, spec=PROBES["reach"]):
     """Demonstrations of the reach probe by the controller that goes straight to the goal, missed by `aim`; until solved or over."""
-    spec, episodes = PROBES["reach"], []
+    episodes = []
     for seed in range(first_seed, first_seed + num):
         sim = spec.make()
         observations, actions, success = [sim.reset(seed)], [], []
@@ -40,3 +40,17 @@ def clone(kind, demos, config, iterations=300, lr=3e-3, seed=0):
         loss.backward()
         optimizer.step()
     return policy.eval()
+
+
+def reach_trainer(method, base, demos=None, spec=PROBES["reach"], **changes):
+    """The trainer of a method on the reach probe, at a scale of seconds; `changes` by flat name, over the method's own."""
+    from pdkit.methods import METHODS
+    from pdkit.methods.registry import make_trainer
+    from pdkit.online_config import OnlineConfig
+    from pdkit.profiles import build
+
+    values = dict(
+        task="reach", seed=0, method=method, total_steps=3000, num_envs=4, env_workers=0, eval_workers=0, warmup_steps=500, utd=0.5,
+        batch=64, n_step=3, on_success="terminate", success_tail=0, gamma=0.9, eval_every=0, log_every=0, checkpoint_every=0,
+        demo_fraction=0.0, hidden=32, layers=2, actor_lr=3e-3, critic_lr=3e-3, tau=0.05, average=0.95, bf16=False, actor_every=1)
+    return make_trainer(build(OnlineConfig, values | METHODS[method].changes | changes), base, demos, spec)

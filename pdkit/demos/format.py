@@ -17,6 +17,7 @@ import numpy as np
 from ..errors import PdkitError
 from ..files import atomic_file
 from ..tasks import get_task
+from ..tasks.spec import TaskSpec
 
 FORMAT = "pdkit-demos-1"
 LABELS = ("scripted", "agent", "human")  # who acted
@@ -69,22 +70,27 @@ class Demos:
                      self.success[:steps], self.lengths[:num], self.seeds[:num], self.extra)
 
 
-def from_episodes(task: str, episodes: list[dict[str, Any]], *, label: str, how: str, command: str, **extra: Any) -> Demos:
+def from_episodes(task: str, episodes: list[dict[str, Any]], *, label: str, how: str, command: str, spec: TaskSpec | None = None,
+                  **extra: Any) -> Demos:
     """Demos from a list of dicts with observations (T+1, obs_dim), actions (T, act_dim), success (T,) and seed."""
     if not episodes:
         raise PdkitError(f"No {task} episode to keep: every attempt failed.")
-    return validate(Demos(
+    made = Demos(
         task, label, how, command,
         np.concatenate([e["observations"] for e in episodes]).astype(np.float32),
         np.concatenate([e["actions"] for e in episodes]).astype(np.float32),
         np.concatenate([e["success"] for e in episodes]).astype(np.bool_),
         np.array([len(e["actions"]) for e in episodes], np.int64),
-        np.array([e.get("seed", -1) for e in episodes], np.int64), extra))
+        np.array([e.get("seed", -1) for e in episodes], np.int64), extra)
+    return validate(made, spec=spec)
 
 
-def validate(demos: Demos, where: str = "demonstrations") -> Demos:
-    """`demos` itself if every shape, range and label is right; otherwise PdkitError naming the first thing that is not."""
-    spec = get_task(demos.task)
+def validate(demos: Demos, where: str = "demonstrations", spec: TaskSpec | None = None) -> Demos:
+    """`demos` itself if every shape, range and label is right; otherwise PdkitError naming the first thing that is not.
+
+    `spec` is for worlds outside the registry, such as the probes.
+    """
+    spec = spec or get_task(demos.task)
     total, num = int(demos.lengths.sum()), demos.num
     problems = [
         (demos.label not in LABELS, f"label {demos.label!r} is none of {', '.join(LABELS)}"),

@@ -1,7 +1,7 @@
 """Where demonstrations come from: bundled in data/demos, scripted experts, the project's agents, human ones through Minari."""
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
@@ -10,6 +10,7 @@ from ..files import DATA
 from ..policies import Policy
 from ..tasks import get_task
 from ..tasks.lanes import IDLE
+from ..tasks.spec import TaskSpec
 from ..tasks.vector import VectorEnv
 from .experts import scripted_episodes
 from .format import Demos, from_episodes, load_demos
@@ -35,6 +36,32 @@ def scripted(task: str, num: int, first_seed: int = 0, noise: float = 0.0, progr
                          command=command)
 
 
+def _play(policy: Policy, spec: TaskSpec, seeds: Sequence[int], lanes: int, noise: float = 0.0,
+          limit: int | None = None) -> Iterator[list[dict]]:
+    """One whole episode for each seed, in lists of those that end together: observations, actions as executed, success and seed."""
+    queue = list(seeds)[::-1]
+    rng = np.random.default_rng(seeds[0])
+    with VectorEnv(spec, lanes, lambda lane: queue.pop() if queue else IDLE, window=policy.window, max_episode_steps=limit) as envs:
+        windows = envs.reset()
+        open_episodes = [[] for _ in range(lanes)]
+        playing = len(seeds)
+        while playing:
+            actions = policy.act(windows)
+            actions = np.clip(actions + noise * rng.standard_normal(actions.shape), -1, 1).astype(np.float32)
+            result = envs.step(actions)
+            for i in range(lanes):
+                if result.steps[i]:
+                    open_episodes[i].append((windows[i, -1], actions[i, 0], bool(result.reward[i]), result.final_windows[i, -1]))
+            ended = []
+            for e in result.episodes:
+                steps, open_episodes[e.lane] = open_episodes[e.lane], []
+                ended.append(dict(observations=np.stack([s[0] for s in steps] + [steps[-1][3]]), actions=np.stack([s[1] for s in steps]),
+                                  success=np.array([s[2] for s in steps]), seed=e.seed))
+            playing -= len(ended)
+            windows = result.windows
+            yield ended
+
+
 def agent_episodes(policy, task: str, num: int, first_seed: int, noise: float, tail: int,
                    progress: Callable[[int, int], None] | None = None) -> list[dict]:
     """`num` successful episodes of a policy acting with Gaussian action noise, cut `tail` steps after their first success.
@@ -42,32 +69,18 @@ def agent_episodes(policy, task: str, num: int, first_seed: int, noise: float, t
     The noise makes the recorded actions, which are the ones executed, vary as a demonstrator's would; episodes that the
     task's limit ends unsolved are dropped.
     """
-    spec, kept, lanes = get_task(task), {}, min(num, 10)
-    queue = list(range(first_seed, first_seed + 4 * num))[::-1]
-    rng = np.random.default_rng(first_seed)
-    with VectorEnv(spec, lanes, lambda lane: queue.pop() if queue else IDLE, window=policy.window) as envs:
-        windows = envs.reset()
-        open_episodes = [[] for _ in range(lanes)]
-        finished = 0
-        while len(kept) < num and finished < 4 * num:
-            actions = policy.act(windows)
-            actions = np.clip(actions + noise * rng.standard_normal(actions.shape), -1, 1).astype(np.float32)
-            result = envs.step(actions)
-            for i in range(lanes):
-                if result.steps[i]:
-                    open_episodes[i].append((windows[i, -1], actions[i, 0], bool(result.reward[i]), result.final_windows[i, -1]))
-            for e in result.episodes:
-                finished += 1
-                steps, open_episodes[e.lane] = open_episodes[e.lane], []
-                if e.success_once:
-                    length = min(len(steps), 1 + next(t for t, s in enumerate(steps) if s[2]) + tail)
-                    steps = steps[:length]
-                    observations = np.stack([s[0] for s in steps] + [steps[-1][3]])
-                    kept[e.seed] = dict(observations=observations, actions=np.stack([s[1] for s in steps]),
-                                        success=np.array([s[2] for s in steps]), seed=e.seed)
-                if progress and len(kept) <= num:
-                    progress(min(len(kept), num), finished)
-            windows = result.windows
+    kept, finished = {}, 0
+    for ended in _play(policy, get_task(task), range(first_seed, first_seed + 4 * num), min(num, 10), noise):
+        for e in ended:
+            finished += 1
+            if e["success"].any():
+                length = 1 + int(np.argmax(e["success"])) + tail
+                kept[e["seed"]] = e | {"observations": e["observations"][: length + 1], "actions": e["actions"][:length],
+                                       "success": e["success"][:length]}
+            if progress and len(kept) <= num:
+                progress(min(len(kept), num), finished)
+        if len(kept) >= num:
+            break
     if len(kept) < num:
         raise PdkitError(f"Only {len(kept)} of {finished} episodes succeeded, {num} were asked for; use a better policy or less noise.")
     return [kept[seed] for seed in sorted(kept)[:num]]
@@ -78,6 +91,15 @@ def from_agent(policy: Policy, task: str, num: int, *, first_seed: int, noise: f
     """Demonstrations made by an agent of this project."""
     return from_episodes(task, agent_episodes(policy, task, num, first_seed, noise, tail, progress), label="agent", how=how,
                          command=command, noise=noise, tail=tail)
+
+
+def rollouts(policy: Policy, spec: TaskSpec, seeds: Sequence[int], limit: int | None = None) -> Demos:
+    """Whole episodes of a policy, one a seed and in that order, successes and failures alike: what a learner must not only imitate."""
+    policy.reset(seeds[0])
+    episodes = [e for ended in _play(policy, spec, seeds, min(len(seeds), 10), limit=limit) for e in ended]
+    episodes.sort(key=lambda e: seeds.index(e["seed"]))
+    return from_episodes(spec.name, episodes, label="agent", how=f"{type(policy).__name__} without action noise, failures kept",
+                         command="pdkit.demos.sources.rollouts", spec=spec)
 
 
 def human(task: str) -> Demos:

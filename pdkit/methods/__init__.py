@@ -25,6 +25,17 @@ class Method:
 # No base action is added and nothing is gated; acting is the actor's own business from the first step.
 _OWN_POLICY = dict(alpha=1.0, alpha_scale=(), H=0, residual_penalty=0.0)
 
+# PPO learns from its own policy alone, with the learning rate falling from the start (as in cleanrl) and a spread that starts at 0.6
+# (cleanrl: 1; the lesson's 0.2 is enough for SAC, whose entropy term raises it)
+_ON_POLICY = dict(warmup="policy", warmup_steps=0, demo_fraction=0.0, lr_decay_from=0.0, log_std_range=(-3.0, 2.0))
+# ... and at the paper's scale, where the SAC code sees raw observations.
+_ON_POLICY_PAPER = dict(ppo_rollout=128, normalize_obs=True)
+
+# Cal-QL: the actor acts from the first step, success ends an episode. The paper gives no number for it: the original's.
+_CALQL = _OWN_POLICY | dict(warmup="policy", on_success="terminate")
+_CALQL_PAPER: dict[str, Any] = dict(calql_offline_updates=20_000, calql_actions=10)
+_CALQL_ORIGINAL = _CALQL_PAPER | dict(utd=1.0, batch=256, gamma=0.99, actor_lr=1e-4, critic_lr=3e-4, tau=0.005, hidden=512)
+
 METHODS: dict[str, Method] = {
     "policy_decorator": Method("Policy Decorator", "facts.md 1"),
     "residual_rl": Method(
@@ -51,4 +62,42 @@ METHODS: dict[str, Method] = {
         paper=dict(utd=20.0, batch=256, gamma=0.99, actor_lr=3e-4, critic_lr=3e-4, tau=0.005, warmup_steps=5_000, total_steps=1_000_000,
                    actor_every=20),
         trainer="pdkit.methods.scratch:Scratch"),
+    "ppo_decorator": Method(
+        "Policy Decorator (PPO)", "appendix D.3; facts.md 4.2: PPO instead of SAC; no numbers given, ours follow cleanrl",
+        changes=_ON_POLICY, paper=_ON_POLICY_PAPER, trainer="pdkit.methods.ppo:OnPolicy"),
+    "ppo_residual_rl": Method(
+        "Residual RL (PPO)", "appendix D.3; facts.md 3.5, 4.2: PPO without bound and schedule",
+        changes=_ON_POLICY | _OWN_POLICY, paper=_ON_POLICY_PAPER, trainer="pdkit.methods.ppo:OnPolicy"),
+    "ppo_finetune": Method(
+        "PPO fine-tuning", "appendix D.3, F.5.1; facts.md 4.2: PPO on the base policy itself, MLP value function",
+        changes=_ON_POLICY | _OWN_POLICY, paper=_ON_POLICY_PAPER, base="bet-sac", trainer="pdkit.methods.ppo:PPOFineTune"),
+    "rot": Method(
+        "ROT", "Haldar et al. 2022; appendix B.5; facts.md 3.1: SAC fine-tuning, reward by optimal transport, Q-filtered imitation",
+        changes=_OWN_POLICY | dict(warmup="policy", demo_fraction=0.0, reward_shift=0.0), base="bet-sac", trainer="pdkit.methods.rot:ROT"),
+    "fish": Method(
+        "FISH", "Haldar et al. 2023; appendix B.5, G.2; facts.md 3.6: residual over VINN on a reward by optimal transport",
+        changes=dict(alpha=0.2, alpha_scale=(), H=0, critic_input="concat", actor_input="obs+base", warmup="uniform", demo_fraction=0.0,
+                     reward_shift=0.0, residual_penalty=0.0), base="vinn", trainer="pdkit.methods.fish:FISH"),
+    "calql": Method(
+        "Cal-QL", "Nakamoto et al. 2023; appendix B.5, F.3 (E); facts.md 3.3: imitated transformer, demonstrations, online SAC",
+        changes=_CALQL | dict(demo_fraction=0.0), paper=_CALQL_PAPER, base="bet-sac", trainer="pdkit.methods.calql:TransformerCalQL"),
+    "calql_a": Method(
+        "Cal-QL, the original", "appendix F.3 (A); facts.md 3.3: small MLP, demonstrations and rollouts, online Cal-QL",
+        changes=_CALQL | dict(demo_fraction=0.5, calql_data="mixed", calql_online="calql"), paper=_CALQL_ORIGINAL,
+        trainer="pdkit.methods.calql:SmallCalQL"),
+    "calql_b": Method(
+        "Cal-QL without rollouts", "appendix F.3 (B): small MLP, demonstrations, online Cal-QL",
+        changes=_CALQL | dict(demo_fraction=0.5, calql_online="calql"), paper=_CALQL_ORIGINAL, trainer="pdkit.methods.calql:SmallCalQL"),
+    "calql_c": Method(
+        "Cal-QL, then SAC", "appendix F.3 (C): small MLP, demonstrations, online SAC",
+        changes=_CALQL | dict(demo_fraction=0.0), paper=_CALQL_ORIGINAL, trainer="pdkit.methods.calql:SmallCalQL"),
+    "calql_d": Method(
+        "Cal-QL on a random GPT", "appendix F.3 (D): GPT from random weights, demonstrations, online SAC",
+        changes=_CALQL | dict(demo_fraction=0.0, calql_pretrained=False), paper=_CALQL_PAPER, base="bet-sac",
+        trainer="pdkit.methods.calql:TransformerCalQL"),
+    "jsrl": Method(
+        "JSRL", "Uchendu et al. 2023; appendix B.5; facts.md 3.4: the base policy begins each episode, a learner from scratch ends it",
+        changes=_OWN_POLICY | dict(warmup="uniform", demo_fraction=0.0, select="last"),
+        lesson=dict(eval_every=2_500, eval_episodes=20),  # the curriculum moves once an evaluation
+        trainer="pdkit.methods.jsrl:JSRL"),
 }

@@ -37,5 +37,10 @@ def base_folder(method: str, task: str) -> Path:
 
 def make_trainer(config: OnlineConfig, base: Policy, demos: Demos | None = None, spec: TaskSpec | None = None) -> Trainer:
     """The trainer of the method named in `config`."""
-    module, name = get_method(config.method).trainer.split(":")
-    return getattr(importlib.import_module(module), name)(config, base, demos, spec)
+    return trainer_of(config.method)(config, base, demos, spec)
+
+
+def trainer_of(method: str) -> type[Trainer]:
+    """The class that runs a method."""
+    module, name = get_method(method).trainer.split(":")
+    return getattr(importlib.import_module(module), name)

@@ -5,8 +5,9 @@ from .base import Normalizer, Policy, load_policy, save_policy
 from .bet import BeT
 from .bet_sac import BeTForSAC
 from .mlp import MLP
+from .vinn import VINN
 from .zero import Zero
 
-POLICIES: dict[str, type[Policy]] = {cls.kind: cls for cls in (BeT, BeTForSAC, MLP, Zero)}
+POLICIES: dict[str, type[Policy]] = {cls.kind: cls for cls in (BeT, BeTForSAC, MLP, VINN, Zero)}
 
-__all__ = ["POLICIES", "BeT", "BeTForSAC", "MLP", "Normalizer", "Policy", "Zero", "load_policy", "save_policy"]
+__all__ = ["POLICIES", "BeT", "BeTForSAC", "MLP", "VINN", "Normalizer", "Policy", "Zero", "load_policy", "save_policy"]

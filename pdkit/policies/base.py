@@ -1,6 +1,7 @@
 """The policy protocol, observation normalisation, and files on disk (safetensors + json, never pickle)."""
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ from torch import nn
 
 from ..errors import PdkitError, unknown
 from ..files import atomic_folder, read_json, sha256, write_json
+from ..tasks.spec import TaskSpec
 
 FORMAT = "pdkit-policy-1"
 
@@ -43,10 +45,16 @@ class Policy(nn.Module):
     kind = ""  # its name in POLICIES
     window = 1  # observations it looks at
     chunk = 1  # primitive actions it returns
+    learns = True  # by gradient steps on `loss`; otherwise `remember` is all there is
 
     def __init__(self, config: dict[str, Any]):
         super().__init__()
         self.config = config  # everything its constructor needs, JSON types only
+
+    @classmethod
+    def for_task(cls, spec: TaskSpec) -> dict[str, Any]:
+        """What of the configuration follows from the task, unless it is given."""
+        return {}
 
     def reset(self, seed: int) -> None:
         """Restart the random numbers that acting draws (dropout, sampling noise): torch's global generator."""
@@ -54,6 +62,11 @@ class Policy(nn.Module):
 
     def fit_statistics(self, observations: np.ndarray, actions: np.ndarray, seed: int = 0) -> None:
         """What is computed from the demonstrations rather than learned: normaliser, k-means bins."""
+        raise NotImplementedError
+
+    def remember(self, windows: torch.Tensor, actions: torch.Tensor) -> None:
+        """Where nothing is learned: keep the demonstrations, as windows (N, window, obs_dim) and the actions (N, act_dim) taken at
+        their last observation."""
         raise NotImplementedError
 
     def parameter_groups(self, weight_decay: float) -> list[dict[str, Any]]:
@@ -72,7 +85,7 @@ class Policy(nn.Module):
     @torch.inference_mode()
     def act(self, windows: np.ndarray) -> np.ndarray:
         """The same with numpy arrays and the actions clipped to [-1, 1]: what every loop calls."""
-        device = next(self.parameters()).device
+        device = next(itertools.chain(self.parameters(), self.buffers())).device
         actions = self(torch.from_numpy(np.require(windows, np.float32, ["C", "W"])).to(device))
         return actions.clamp(-1, 1).float().cpu().numpy()
 

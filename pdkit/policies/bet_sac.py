@@ -17,6 +17,7 @@ import torch.nn.functional as F
 from torch import nn
 
 from ..errors import PdkitError
+from ..tasks.spec import TaskSpec
 from .bet import BeT, focal_loss
 
 EDGE = 0.999  # actions are clipped to this share of their range before atanh
@@ -48,6 +49,11 @@ class BeTForSAC(BeT):
         nn.init.constant_(self.spread.bias, math.atanh(2 * (FIRST_LOG_STD - low) / (high - low) - 1))
         if c["lora"]:
             self._add_lora(c["lora"])
+
+    @classmethod
+    def for_task(cls, spec: TaskSpec) -> dict[str, Any]:
+        """The paper's scale: 0.5 for every Adroit joint, 0.3 for a ManiSkill gripper, which is the last dimension."""
+        return {"scale": [0.5] * spec.act_dim if spec.suite == "adroit" else [1.0] * (spec.act_dim - 1) + [0.3]}
 
     def _add_lora(self, rank: int) -> None:
         """Freeze everything but low-rank adapters on attention and regression head, and the head of the spread."""
@@ -95,15 +101,23 @@ class BeTForSAC(BeT):
         return self.squashed(self.centres[choice]) + offsets.float(), log_std
 
     def forward(self, windows: torch.Tensor) -> torch.Tensor:
-        return (torch.tanh(self.gaussian(windows)[0]) / self.scale)[:, None]
+        return self.squash(self.gaussian(windows)[0])[:, None]
+
+    def squash(self, u: torch.Tensor) -> torch.Tensor:
+        """From before the tanh to the action."""
+        return torch.tanh(u) / self.scale
+
+    def heads(self, stored: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Mean and log_std (B, act_dim) before the tanh for stored, flattened windows (B, window * obs_dim)."""
+        return self.gaussian(stored.unflatten(-1, (self.window, -1)))
 
     def sample(self, stored: torch.Tensor, noise: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Actions (B, act_dim) for stored, flattened windows (B, window * obs_dim) and standard normal noise (B, act_dim);
         and log pi (B,) of tanh(u), as SAC has it: the constant log(scale) is left out."""
-        mean, log_std = self.gaussian(stored.unflatten(-1, (self.window, -1)))
+        mean, log_std = self.heads(stored)
         u = mean + log_std.exp() * noise
         log_prob = -0.5 * noise.square() - log_std - 0.5 * math.log(2 * math.pi) - 2 * (math.log(2) - u - F.softplus(-2 * u))
-        return torch.tanh(u) / self.scale, log_prob.sum(dim=-1)
+        return self.squash(u), log_prob.sum(dim=-1)
 
     def mean_action(self, stored: torch.Tensor) -> torch.Tensor:
         """The deterministic action (B, act_dim) for flattened windows."""

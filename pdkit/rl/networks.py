@@ -51,7 +51,12 @@ class Actor(nn.Module):
 
     def mean_action(self, x: torch.Tensor) -> torch.Tensor:
         """The deterministic action tanh(mean), (B, act_dim): what evaluation executes."""
-        return torch.tanh(self.heads(x)[0])
+        return self.squash(self.heads(x)[0])
+
+    @staticmethod
+    def squash(u: torch.Tensor) -> torch.Tensor:
+        """From before the tanh to the action."""
+        return torch.tanh(u)
 
 
 class Critics(nn.Module):

@@ -15,12 +15,13 @@ COLUMNS = ("obs", "residual", "base", "reward", "next_obs", "next_base", "discou
 
 
 class Replay:
-    """A ring of transitions in one float32 matrix, so that sampling is one gather."""
+    """A ring of transitions in one float32 matrix, so that sampling is one gather; `extra` names further numbers, one a row."""
 
-    def __init__(self, capacity: int, obs_dim: int, act_dim: int, device: str = "cpu"):
-        widths = [obs_dim, act_dim, act_dim, 1, obs_dim, act_dim, 1]
+    def __init__(self, capacity: int, obs_dim: int, act_dim: int, device: str = "cpu", extra: tuple[str, ...] = ()):
+        widths = [obs_dim, act_dim, act_dim, 1, obs_dim, act_dim, 1, *[1] * len(extra)]
         ends = np.cumsum(widths)
-        self.slices = {name: slice(int(e - w), int(e)) for name, w, e in zip(COLUMNS, widths, ends, strict=True)}
+        self.slices = {name: slice(int(e - w), int(e)) for name, w, e in zip(COLUMNS + extra, widths, ends, strict=True)}
+        self.scalars = ("reward", "discount", *extra)
         self.rows = torch.zeros(capacity, int(ends[-1]), device=device)
         self.capacity, self.size, self.position = capacity, 0, 0
 
@@ -39,8 +40,8 @@ class Replay:
         return self.rows[torch.randint(self.size, (count,), generator=generator).to(self.rows.device)]
 
     def unpack(self, rows: torch.Tensor) -> dict[str, torch.Tensor]:
-        """Columns by name; reward and discount as (B,)."""
-        return {name: rows[:, s] if name not in ("reward", "discount") else rows[:, s.start] for name, s in self.slices.items()}
+        """Columns by name; reward, discount and the extra ones as (B,)."""
+        return {name: rows[:, s.start] if name in self.scalars else rows[:, s] for name, s in self.slices.items()}
 
 
 class NStep:

@@ -21,6 +21,7 @@ from ..decorator import DecoratorConfig, actor_features, critic_features
 from ..errors import PdkitError, unknown
 from ..torch_setup import autocast
 from .networks import Actor, Critics
+from .state import pack, unpack
 
 ACTOR_VALUES = ("min", "mean")
 
@@ -72,17 +73,19 @@ class SAC:
         obs_dim, act_dim: what critics see of an observation, and the action.
         normalize: maps stored observations before any network sees them (identity by default).
         actor: another actor than the small Gaussian one: a module with `sample` and `mean_action` as `Actor` has them.
+        critics: other critics than the plain ones: a `Critics`.
         critic_view: what critics see of a normalised observation, (B, stored) -> (B, obs_dim); all of it by default.
     """
 
     def __init__(self, obs_dim: int, act_dim: int, config: SACConfig, decorator: DecoratorConfig, *, normalize=None,
-                 actor: nn.Module | None = None, critic_view=None, device: str = "cpu"):
+                 actor: nn.Module | None = None, critics: Critics | None = None, critic_view=None, device: str = "cpu"):
         self.config, self.decorator, self.device = config, decorator, device
         self.normalize, self.critic_view = normalize or _same, critic_view or _same
         c = config
         self.actor = (actor or Actor(decorator.actor_dim(obs_dim, act_dim), act_dim, c.hidden, c.layers, c.actor_layer_norm,
                                      c.log_std_range)).to(device)
-        self.critics = Critics(decorator.critic_dim(obs_dim, act_dim), c.hidden, c.layers, c.num_critics, c.critic_layer_norm).to(device)
+        self.critics = (critics or Critics(decorator.critic_dim(obs_dim, act_dim), c.hidden, c.layers, c.num_critics,
+                                           c.critic_layer_norm)).to(device)
         self.targets = copy.deepcopy(self.critics).requires_grad_(False)
         self.average = copy.deepcopy(self.actor).requires_grad_(False)
         if c.compile:
@@ -106,14 +109,14 @@ class SAC:
                 return self.actor.sample(x, noise)[0]
             return (self.average if self.config.average else self.actor).mean_action(x)
 
-    def update(self, batch: dict[str, torch.Tensor], generator: torch.Generator) -> dict[str, torch.Tensor]:
-        """One gradient step on each part; scalar tensors for the log (no synchronisation with the device)."""
+    def update(self, batch: dict[str, torch.Tensor], generator: torch.Generator, critics: bool = True) -> dict[str, torch.Tensor]:
+        """One gradient step on each part, the critics only if asked; scalar tensors for the log (no synchronisation with the device)."""
         obs, next_obs = self.normalize(batch["obs"]), self.normalize(batch["next_obs"])
         noise = torch.randn((2, *batch["base"].shape), generator=generator).to(self.device)
         temperature = self.log_temperature.detach().exp()
         c = self.config
         members = torch.randperm(c.num_critics, generator=generator)[: c.target_subset] if c.target_subset else None
-        log = self._update_critics(batch, obs, next_obs, noise[0], temperature, members)
+        log = self._update_critics(batch, obs, next_obs, noise[0], temperature, members) if critics else {}
         if self.updates % self.config.actor_every == 0:
             log |= self._update_actor(batch, obs, noise[1], temperature)
         with torch.no_grad():
@@ -137,12 +140,17 @@ class SAC:
         with autocast(self.device, self.config.bf16):
             values = self.critics(critic_features(self.decorator, self.critic_view(obs), batch["base"], batch["residual"]))
             loss = F.mse_loss(values, target.expand_as(values), reduction="none").mean(dim=1).sum()
+            loss = loss + self._critic_penalty(batch, obs, values)
         self.critic_optimizer.zero_grad(set_to_none=True)
         loss.backward()
         for member in self.critics.members:
             torch.nn.utils.clip_grad_norm_(member.parameters(), self.config.grad_clip)
         self.critic_optimizer.step()
         return {"critic_loss": loss.detach() / self.config.num_critics, "q_mean": values.detach().mean(), "target_mean": target.mean()}
+
+    def _critic_penalty(self, batch, obs, values) -> torch.Tensor | float:
+        """What a subclass adds to the critics' loss, summed over them; `values` (num_critics, B) are those of the batch's actions."""
+        return 0.0
 
     def _update_actor(self, batch, obs, noise, temperature) -> dict[str, torch.Tensor]:
         self.critics.requires_grad_(False)  # their weights' gradients would be thrown away
@@ -151,6 +159,7 @@ class SAC:
             values = self.critics(critic_features(self.decorator, self.critic_view(obs), batch["base"], residual))
             value = values.mean(dim=0) if self.config.actor_value == "mean" else values.min(dim=0).values
             loss = (temperature * log_pi - value).mean() + self.config.residual_penalty * residual.square().mean()
+            loss = self._actor_loss(loss, batch, obs, value)
         if self.updates >= self.config.critic_warmup:
             self.actor_optimizer.zero_grad(set_to_none=True)
             loss.backward()
@@ -169,6 +178,10 @@ class SAC:
             self.temperature_optimizer.step()
         return {"actor_loss": loss.detach(), "entropy": entropy, "temperature": temperature, "residual_abs": residual.detach().abs().mean()}
 
+    def _actor_loss(self, loss: torch.Tensor, batch, obs: torch.Tensor, value: torch.Tensor) -> torch.Tensor:
+        """What the actor descends, of SAC's own loss and the values (B,) of its actions: some methods add to it."""
+        return loss
+
     def scale_lr(self, factor: float) -> None:
         """Scale the learning rates of actor and critics (smaller late steps)."""
         for optimizer, lr in ((self.actor_optimizer, self.config.actor_lr), (self.critic_optimizer, self.config.critic_lr)):
@@ -178,11 +191,7 @@ class SAC:
     def state(self) -> dict[str, torch.Tensor]:
         """Everything that training goes on from, as named tensors."""
         tensors = {"log_temperature": self.log_temperature.detach(), "updates": torch.tensor(self.updates)}
-        for name, module in self._modules().items():
-            tensors |= {f"{name}.{k}": v for k, v in module.state_dict().items()}
-        for name, optimizer in self._optimizers().items():
-            for i, slots in optimizer.state_dict()["state"].items():
-                tensors |= {f"{name}.{i}.{slot}": value for slot, value in slots.items()}
+        tensors |= pack(self._modules(), self._optimizers())
         return {k: v.detach().cpu().clone().contiguous() for k, v in tensors.items()}
 
     def load(self, tensors: dict[str, torch.Tensor]) -> None:
@@ -190,15 +199,7 @@ class SAC:
         with torch.no_grad():
             self.log_temperature.copy_(tensors["log_temperature"])
         self.updates = int(tensors["updates"])
-        for name, module in self._modules().items():
-            module.load_state_dict({k.removeprefix(f"{name}."): v for k, v in tensors.items() if k.startswith(f"{name}.")})
-        for name, optimizer in self._optimizers().items():
-            state: dict[int, dict[str, torch.Tensor]] = {}
-            for key, value in tensors.items():
-                if key.startswith(f"{name}."):
-                    _, index, slot = key.split(".")
-                    state.setdefault(int(index), {})[slot] = value.clone()
-            optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})
+        unpack(tensors, self._modules(), self._optimizers())
 
     def _modules(self):
         return {"actor": self.actor, "critics": self.critics, "targets": self.targets, "average": self.average}

@@ -1,0 +1,42 @@
+"""Demonstrations in the form in which the online loop stores what happens."""
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from .decorator import scaled
+from .demos.format import Demos
+from .online_config import OnlineConfig, stops
+from .policies import Policy
+from .rl.replay import NStep
+
+
+def last_observation(windows: np.ndarray) -> np.ndarray:
+    """What most methods store of windows (N, window, obs_dim): the latest observations (N, obs_dim)."""
+    return windows[:, -1]
+
+
+def demo_rows(demos: Demos, base: Policy, config: OnlineConfig,
+              view: Callable[[np.ndarray], np.ndarray] = last_observation, steps: NStep | None = None) -> list[np.ndarray]:
+    """Demonstrations as replay rows: the residual stored is the one that makes the executed action the demonstrated one.
+
+    An episode ends as training episodes do: at its first success with on_success="terminate", else at its own end, as a
+    time limit (the value of its last state counts). `steps` makes the rows (one lane).
+    """
+    steps, rows = steps or NStep(1, config.n_step, config.gamma), []
+    for episode in demos.episodes():
+        observations, actions, success = episode["observations"], episode["actions"], episode["success"]
+        length = len(actions)
+        if config.on_success == "terminate" and success.any():
+            length = int(np.argmax(success)) + 1
+        padded = np.concatenate([np.repeat(observations[:1], base.window - 1, axis=0), observations])
+        windows = np.lib.stride_tricks.sliding_window_view(padded, base.window, axis=0).transpose(0, 2, 1)[: length + 1]
+        bases, seen = base.act(windows)[:, 0], view(windows)
+        residuals = (actions[:length] - bases[:length]) / np.maximum(scaled(config.decorator, np.ones_like(bases[:length])), 1e-6)
+        for t in range(length):
+            last = t == length - 1
+            terminated = last and config.on_success == "terminate" and bool(success[t])
+            rows += steps.push(0, seen[t], residuals[t], bases[t], float(success[t]) + config.reward_shift, seen[t + 1],
+                               bases[t + 1], stops(config, terminated, last and not terminated), last)
+    return rows

@@ -1,0 +1,130 @@
+"""VINN: imitation by nearest neighbours, without a gradient step (Pari et al., 2021; facts.md 3.6; appendix B.5, G.2).
+
+    d_i = |phi(o) - phi(o_i)|,   a = sum_i softmax(-d)_i a_i   over the k nearest observations o_i of the demonstrations
+
+phi is either the normalised observation ("raw") or what the GPT of a trained Behavior Transformer makes of the window, at its last
+position; the FiLM features of Diffusion Policy are left out. k = 1 copies the nearest action, as FISH does. `exclusion` adds FISH's
+buffer against getting stuck: a neighbour that comes up for more than the `tolerance`-th time is passed over for the next nearest, and
+stays out until `exclusion` others have been put out after it (FISH: 3 and 1).
+
+FISH carries that buffer from step to step. A policy here holds no state per episode, so the buffer is played through again from the
+last `history` observations; what was chosen before them is forgotten. How large k is in the paper is not known: 5 is ours.
+"""
+from __future__ import annotations
+
+from collections import Counter, deque
+from typing import Any
+
+import torch
+from torch import nn
+
+from ..errors import PdkitError
+from .base import Normalizer, Policy, load_policy
+from .bet import BeT
+
+
+class VINN(Policy):
+    """Config: obs_dim, act_dim, k, exclusion (0: none), tolerance, history, representation ("raw", or the folder of a trained bet, which
+    is replaced by its configuration; its GPT is part of this policy's weights), rows (of the library; 0 before `remember`)."""
+
+    kind = "vinn"
+    learns = False
+    defaults: dict[str, Any] = dict(k=5, exclusion=0, tolerance=1, history=20, representation="raw", rows=0)
+
+    def __init__(self, config: dict[str, Any]):
+        super().__init__(self.defaults | config)
+        c = self.config
+        if c["k"] < 1 or c["exclusion"] < 0 or c["tolerance"] < 1 or c["history"] < 1:
+            raise PdkitError("VINN needs k, tolerance and history of at least 1 and exclusion of at least 0.")
+        if c["exclusion"] and c["k"] != 1:
+            raise PdkitError(f"VINN's exclusion buffer chooses one neighbour; set k=1 (now {c['k']}) or exclusion=0.")
+        trained = self._representation()
+        self.normalizer = Normalizer(c["obs_dim"])
+        self.gpt: nn.Module | None = trained.gpt if trained else None
+        if trained:
+            self.normalizer.load_state_dict(trained.normalizer.state_dict())
+        self.looks = trained.window if trained else 1  # observations that make one feature
+        self.window = self.looks + (c["history"] if c["exclusion"] else 0)
+        self.feature_dim = trained.config["features"] if trained else c["obs_dim"]
+        self.register_buffer("library", torch.zeros(c["rows"], self.feature_dim))
+        self.register_buffer("actions", torch.zeros(c["rows"], c["act_dim"]))
+        self.requires_grad_(False).eval()
+
+    def _representation(self) -> BeT | None:
+        """The Behavior Transformer whose features are used: new from its configuration (weights follow), or read from its folder."""
+        given = self.config["representation"]
+        if given == "raw":
+            return None
+        trained = BeT(given) if isinstance(given, dict) else load_policy(given)
+        if type(trained) is not BeT:
+            raise PdkitError(f"VINN takes the features of a policy of kind bet, not {trained.kind}; train one with `pdkit train base`.")
+        if (trained.config["obs_dim"], trained.config["act_dim"]) != (self.config["obs_dim"], self.config["act_dim"]):
+            raise PdkitError("VINN's representation was trained for other observations or actions; give one of the same task.")
+        self.config["representation"] = trained.config
+        return trained
+
+    def train(self, mode: bool = True) -> VINN:
+        """Nothing is trained; the features stay those of evaluation (no dropout)."""
+        return super().train(False)
+
+    def fit_statistics(self, observations, actions, seed: int = 0) -> None:
+        """Normaliser from observations (N, obs_dim); a trained representation keeps its own."""
+        if self.gpt is None:
+            self.normalizer.fit(observations)
+
+    @torch.no_grad()
+    def remember(self, windows: torch.Tensor, actions: torch.Tensor) -> None:
+        """Make the library: windows (N, window, obs_dim), and the actions (N, act_dim) taken at their last observation."""
+        if len(windows) < max(self.config["k"], self.config["exclusion"] + 1):
+            raise PdkitError(f"VINN needs at least as many demonstrated steps as neighbours, not {len(windows)}; use more demonstrations.")
+        self.library = torch.cat([self.features(part) for part in windows.to(self.library.device).split(1024)])
+        self.actions = actions.to(self.library.device).clone()
+        self.config["rows"] = len(windows)
+
+    def features(self, windows: torch.Tensor) -> torch.Tensor:
+        """phi (N, feature_dim) of windows (N, at least `looks`, obs_dim)."""
+        seen = self.normalizer(windows[:, -self.looks:])
+        return seen[:, -1] if self.gpt is None else self.gpt(seen)[:, -1].float()
+
+    def _nearest(self, features: torch.Tensor, k: int) -> tuple[torch.Tensor, torch.Tensor]:
+        """Distances and rows (N, k) of the nearest of the library, nearest first."""
+        if not len(self.library):
+            raise PdkitError("This VINN has no demonstrations to look up; make one with `pdkit train base TASK --policy vinn`.")
+        # Not by matrix products: their rounding would not be 0 at a demonstrated observation.
+        distance = torch.cdist(features, self.library, compute_mode="donot_use_mm_for_euclid_dist")
+        return tuple(distance.topk(k, dim=1, largest=False))
+
+    def forward(self, windows: torch.Tensor) -> torch.Tensor:
+        if self.config["exclusion"]:
+            return self.actions[self._choose(windows)][:, None]
+        distance, rows = self._nearest(self.features(windows), self.config["k"])
+        return (torch.softmax(-distance, dim=1)[..., None] * self.actions[rows]).sum(dim=1, keepdim=True)
+
+    def _choose(self, windows: torch.Tensor) -> torch.Tensor:
+        """Rows (N,) of the library after the exclusion buffer of each window has been played through."""
+        past = windows.shape[1] - self.looks
+        steps = windows.unfold(1, self.looks, 1).transpose(2, 3)  # (N, past + 1, looks, obs_dim)
+        nearest = self._nearest(self.features(steps.flatten(0, 1)), self.config["exclusion"] + 1)[1].view(len(windows), past + 1, -1)
+        # Before an episode's start its first observation repeats: no decision was made there.
+        repeats = (windows == windows[:, :1]).all(dim=2).long().cumprod(dim=1).sum(dim=1)
+        starts = (repeats - self.looks).clamp(0, past)
+        chosen = [self._play(rows[start:]) for rows, start in zip(nearest.tolist(), starts.tolist(), strict=True)]
+        return torch.tensor(chosen, device=windows.device)
+
+    def _play(self, decisions: list[list[int]]) -> int:
+        """The last choice of a sequence of decisions, each the nearest rows in order."""
+        out: deque[int] = deque(maxlen=self.config["exclusion"])
+        seen: Counter[int] = Counter()
+        choice = -1
+        for rows in decisions:
+            choice = rows[-1]
+            for row in rows:
+                if row in out:
+                    continue
+                seen[row] += 1
+                if seen[row] <= self.config["tolerance"]:
+                    choice = row
+                    break
+                seen[row] = 0
+                out.append(row)
+        return choice

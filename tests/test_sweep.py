@@ -1,0 +1,374 @@
+"""Sweeps: refused before anything runs, failures and killed workers cost one job, a second go resumes, Ctrl-C ends children too."""
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import nbformat
+import pandas as pd
+import pytest
+from sweep_jobs import job, play
+
+from pdkit import cli, nb, recorded, sweep, sweep_ray, sweep_run
+from pdkit.errors import PdkitError
+from pdkit.files import DATA, ROOT, read_json, write_json
+from pdkit.main_job import expected_minutes
+from pdkit.profiles import online_config
+from pdkit.sweep_progress import Progress
+from pdkit.sweep_run import Job, Local, run_jobs
+
+
+def ran(one: Job) -> int:
+    path = one.folder / "ran"
+    return len(path.read_text()) if path.exists() else 0
+
+
+def gone(pid: int, seconds: float = 10.0) -> bool:
+    """Whether a process ends (or is only a zombie) within some seconds."""
+    for _ in range(int(seconds / 0.1)):
+        try:
+            if Path(f"/proc/{pid}/stat").read_text().split(")")[1].split()[0] == "Z":
+                return True
+        except OSError:
+            return True
+        time.sleep(0.1)
+    return False
+
+
+def pids(one: Job, seconds: float = 60.0) -> list[int]:
+    path, deadline = one.folder / "pids", time.monotonic() + seconds
+    while not (path.exists() and len(path.read_text().split()) == 2):
+        assert time.monotonic() < deadline, "the job never started"
+        time.sleep(0.05)
+    return [int(word) for word in path.read_text().split()]
+
+
+# ---- scheduling ------------------------------------------------------------------------------------------------------
+
+def test_failures_and_a_killed_worker_cost_one_job_each_and_a_second_go_runs_only_those(tmp_path, capsys):
+    jobs = [job(tmp_path, "a", value=3), job(tmp_path, "b", fail=True), job(tmp_path, "c", die=True), job(tmp_path, "d", crash=True),
+            job(tmp_path, "e", value=5)]
+    problems = sweep.sweep(jobs, Local(), 2, play)
+    assert problems == {"T b seed 0": "It broke; mend it.", "T c seed 0": "it was killed by SIGKILL (is memory short?)",
+                        "T d seed 0": "ZeroDivisionError: by nothing"}
+    assert [one.result.exists() for one in jobs] == [True, False, False, False, True]
+    assert read_json(jobs[4].result)["row"] == {"value": 5} and read_json(jobs[4].result)["parameters"] == {"value": 5}
+    assert "Traceback" in (jobs[3].folder / "log.txt").read_text()  # what is no sentence of ours is kept for the reader
+    out = capsys.readouterr().out
+    assert out.startswith("5 jobs, 0 finished, 5 to do, 2 at a time: about 2 minutes\n")
+    assert re.search(r"\n\w+ T . seed 0; 2 of 5 done, 0 running, 3 failed\n$", out)
+    mended = [job(tmp_path, one.labels["recipe"], value=1) for one in jobs]
+    assert sweep.sweep(mended, Local(), 2, play) == {}
+    assert [ran(one) for one in jobs] == [1, 2, 2, 2, 1] and not (jobs[1].folder / "failed.txt").exists()
+
+
+def test_no_more_than_the_limit_run_at_once_and_all_do(tmp_path):
+    class Counting(Local):
+        most = alive = 0
+
+        def start(self, function, one):
+            self.alive += 1
+            self.most = max(self.most, self.alive)
+            return super().start(function, one)
+
+        def problem(self, handle, one):
+            self.alive -= 1
+            return super().problem(handle, one)
+
+    jobs, backend = [job(tmp_path, name) for name in "abcd"], Counting()
+    assert run_jobs(jobs, play, backend, 2, Progress(jobs, 0, 2)) == {}
+    assert backend.most == 2 and all(one.result.exists() for one in jobs)
+
+
+def test_what_a_killed_worker_started_is_killed_too(tmp_path):
+    one = job(tmp_path, "a", sleep=True)
+
+    class Killing(Local):
+        def ended(self, handles, timeout):
+            os.kill(pids(one)[0], signal.SIGKILL)
+            return super().ended(handles, timeout)
+
+    assert list(run_jobs([one], play, Killing(), 1, Progress([one], 0, 1))) == [one.name]
+    assert gone(pids(one)[1], 2)
+
+
+SCHEDULER = """
+import sys; sys.path.insert(0, {tests!r})
+from pathlib import Path
+from sweep_jobs import job, play
+if __name__ == "__main__":
+    from pdkit.sweep import Local, sweep
+    sweep([job(Path({folder!r}), "a", sleep=True), job(Path({folder!r}), "b")], Local(), 1, play)
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
+def test_the_scheduler_takes_all_its_children_with_it(tmp_path, number):
+    script = tmp_path / "scheduler.py"
+    script.write_text(SCHEDULER.format(tests=str(Path(__file__).parent), folder=str(tmp_path)))
+    process = subprocess.Popen([sys.executable, script], env=os.environ | {"PYTHONPATH": str(ROOT)}, stderr=subprocess.PIPE, text=True)
+    one, two = job(tmp_path, "a"), job(tmp_path, "b")
+    worker, child = pids(one)
+    started = time.monotonic()
+    process.send_signal(number)
+    assert "KeyboardInterrupt" in process.communicate()[1] or number == signal.SIGKILL
+    assert gone(worker) and gone(child) and time.monotonic() - started < 15
+    assert not one.result.exists() and not two.folder.exists()  # no result of half a job, nothing further started
+
+
+def test_the_time_left_follows_what_jobs_alike_took(tmp_path):
+    jobs = [job(tmp_path, "a1", 1.0), job(tmp_path, "a2", 1.0), job(tmp_path, "b1", 2.0)]
+    assert Progress(jobs, 0, 1).seconds_left() == 240 and Progress(jobs, 0, 2).seconds_left() == 120
+    assert Progress(jobs, 0, 4).seconds_left() == 120  # no sooner than the longest
+    measured = [("a", 30.0, 1.0), ("b", 240.0, 2.0)]
+    assert Progress(jobs, 2, 1, measured).seconds_left() == 30 + 30 + 240
+    assert Progress(jobs, 1, 1, measured[:1]).seconds_left() == 30 + 30 + 60  # unknown b: as far off as the others
+    late = Progress(jobs[:1], 0, 1)
+    late.started(jobs[0])
+    late.running[jobs[0].name] = (jobs[0], time.monotonic() - 500)  # it takes longer than expected
+    assert late.text() == "0 of 1 done, 1 running, 0 failed, less than a minute left"
+    unknown = [job(tmp_path, "n1", None), job(tmp_path, "n2", None)]
+    assert Progress(unknown, 0, 1).seconds_left() is None and "not known yet" in Progress(unknown, 0, 1).text()
+    assert Progress(unknown, 1, 1, [("n", 50.0, None)]).seconds_left() == 100
+
+
+# ---- specs -----------------------------------------------------------------------------------------------------------
+
+SPEC = {"name": "tiny", "kind": "train", "seeds": [0], "fixed": {"task": "Door", "profile": "smoke", "episodes": 2},
+        "grid": {"alpha": [0.1, 0.3]}}
+BOOK = {"name": "book", "kind": "notebook", "fixed": {"notebook": "05", "profile": "smoke"}, "grid": {"alpha": [0.1]}}
+
+
+def written(folder: Path, **changes) -> Path:
+    path = folder / "spec.json"
+    path.write_text(json.dumps({k: v for k, v in (SPEC | changes).items() if v is not None}))
+    return path
+
+
+def test_cells_are_the_grid_and_the_further_ones_by_each_seed(tmp_path):
+    path = written(tmp_path, seeds=[0, 1], grid={"alpha": [0.1, 0.3], "H": [0, 100]},
+                   cells=[{"critic_input": "concat"}, {"recipe": "other", "method": "residual_rl"}])
+    jobs = sweep.make_jobs(sweep.load_spec(path))
+    assert len(jobs) == (2 * 2 + 2) * 2 and len({one.folder for one in jobs}) == 12
+    assert [one.labels["recipe"] for one in jobs[::2]] == [
+        "alpha=0.1,H=0", "alpha=0.1,H=100", "alpha=0.3,H=0", "alpha=0.3,H=100", "critic_input=concat", "other"]
+    assert jobs[1].command == ("pdkit train decorated Door --method policy_decorator --profile smoke --recipe alpha=0.1,H=0 --episodes 2 "
+                               "--seeds 1 --set alpha=0.1 H=0")
+    assert jobs[-1].config["alpha"] == 1.0 and jobs[0].minutes == expected_minutes(online_config("Door", "smoke", alpha=0.1, H=0), 2)
+
+
+def test_a_toml_file_says_the_same_as_a_json_file(tmp_path):
+    toml = tmp_path / "spec.toml"
+    toml.write_text('name = "tiny"\nkind = "train"\nseeds = [0]\n[fixed]\ntask = "Door"\nprofile = "smoke"\nepisodes = 2\n'
+                    "[grid]\nalpha = [0.1, 0.3]\n")
+    assert sweep.make_jobs(sweep.load_spec(toml)) == sweep.make_jobs(sweep.load_spec(written(tmp_path)))
+
+
+def test_the_folder_follows_every_parameter_and_nothing_else(tmp_path):
+    def folder(**changes):
+        return sweep.make_jobs(sweep.load_spec(written(tmp_path, **changes)))[0].folder
+
+    assert folder() == folder(seeds=[0, 1], grid={"alpha": [0.1]}, minutes=3, record="x")
+    different = [folder(), folder(seeds=[1]), folder(grid={"alpha": [0.2]}), folder(fixed=SPEC["fixed"] | {"episodes": 3}),
+                 folder(fixed=SPEC["fixed"] | {"method": "residual_rl"}), folder(name="other")]
+    assert len(set(different)) == len(different)
+
+
+@pytest.mark.parametrize("changes, said", [
+    ({"girds": {}}, "Unknown key of spec.json 'girds'"),
+    ({"kind": "trian"}, "Did you mean 'train'?"),
+    ({"kind": None}, "Unknown kind in spec.json ''"),
+    ({"seeds": [0, 0]}, "seeds must be different"),
+    ({"seeds": [-1]}, "seeds must be different"),
+    ({"seeds": 3}, "seeds must be a list"),
+    ({"name": "a/b"}, "name must be a word"),
+    ({"record": "../x"}, "record must be a word"),
+    ({"minutes": 0}, "minutes must be a number above 0"),
+    ({"grid": {"alpha": 0.1}}, "grid holds lists"),
+    ({"grid": {"alpha": []}}, "grid holds lists"),
+    ({"grid": {"episodes": [1]}}, "given in fixed and in grid"),
+    ({"grid": {"seed": [1]}}, "give seeds at the top"),
+    ({"cells": [3]}, "cells must be a list of tables"),
+    ({"fixed": {"task": "Dor"}}, "Did you mean 'Door'?"),
+    ({"fixed": {}}, "a training needs a task"),
+    ({"grid": {"method": ["sac_fintune"]}}, "Did you mean 'sac_finetune'?"),
+    ({"grid": {"alhpa": [0.1]}}, "Did you mean 'alpha'?"),
+    ({"grid": {"alpha": [0.1, 7.0]}}, "must be in (0, 1], not 7.0"),
+    ({"grid": {"alpha": ["wide"]}}, "alpha must be of type float"),
+    ({"fixed": {"task": "Door", "profile": "fast"}}, "Unknown profile 'fast'"),
+    ({"fixed": {"task": "Door", "episodes": 0}}, "episodes must be a whole number"),
+    ({"fixed": {"task": "Door", "base": "runs/none"}}, "runs/none/policy.json does not exist"),
+    ({"fixed": {"task": "Door", "demos": "runs/none.safetensors"}}, "none.safetensors"),
+    ({"grid": {"alpha_scale": [[1, 2]]}}, "Give the cell 'alpha_scale=[1, 2]' a recipe"),
+    ({"cells": [{"alpha": 0.1, "recipe": "again"}]}, "alpha=0.1 and again are the same job"),
+    ({"cells": [{"alpha": 0.2, "recipe": "alpha=0.1"}]}, "are called the same"),
+    (BOOK | {"fixed": {}}, "needs notebook"),
+    (BOOK | {"fixed": {"notebook": "99"}}, "Unknown notebook '99'"),
+    (BOOK | {"grid": {"alhpa": [0.1]}}, "Did you mean 'alpha'?"),
+    (BOOK | {"grid": {"alpha": ["wide"]}}, "Parameter alpha must be float"),
+])
+def test_what_is_wrong_is_one_sentence_before_anything_runs(tmp_path, monkeypatch, capsys, changes, said):
+    monkeypatch.setenv("PDKIT_RUNS", str(tmp_path / "runs"))
+    assert cli.main(["sweep", str(written(tmp_path, **changes))]) == 2
+    out, err = capsys.readouterr()
+    assert said in err and len(err.strip().splitlines()) == 1 and out == "" and not (tmp_path / "runs").exists()
+
+
+@pytest.mark.parametrize("name, text, said", [
+    ("a.toml", "name = ", "is not a readable TOML file"), ("a.json", "{", "is not a readable JSON file"),
+    ("a.json", "[]", "must hold a table"), ("a.yaml", "a: 1", "a .toml or .json file"), ("a.toml", None, "Cannot read"),
+])
+def test_files_that_are_no_spec_are_refused(tmp_path, capsys, name, text, said):
+    if text is not None:
+        (tmp_path / name).write_text(text)
+    assert cli.main(["sweep", str(tmp_path / name)]) == 2
+    assert said in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("words, said", [(["--workers", "0"], "at least 1"), (["--record", "a/b"], "--record takes a name")])
+def test_bad_options_are_refused(tmp_path, capsys, words, said):
+    assert cli.main(["sweep", str(written(tmp_path)), *words]) == 2
+    assert said in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name, cells", [("leaderboard", 6), ("ablations", 15)])
+def test_the_specs_of_the_recorded_results_are_right(name, cells):
+    spec = sweep.load_spec(DATA / "sweeps" / f"{name}.toml")
+    jobs = sweep.make_jobs(spec)
+    assert spec.name == spec.record == name and len(jobs) == 5 * cells
+    assert all(one.config["total_steps"] == 40_000 and one.parameters["episodes"] == 200 for one in jobs)
+
+
+# ---- real jobs -------------------------------------------------------------------------------------------------------
+
+@pytest.fixture
+def results(tmp_path, monkeypatch):
+    """data/results and runs/ in a temporary folder."""
+    monkeypatch.setattr(recorded, "DATA", tmp_path / "data")
+    monkeypatch.setenv("PDKIT_RUNS", str(tmp_path / "runs"))
+    return tmp_path / "data" / "results"
+
+
+def test_a_real_grid_of_two_trainings_is_recorded_and_skipped_the_second_time(tmp_path, results, capsys, monkeypatch):
+    path = written(tmp_path)
+    assert cli.main(["sweep", str(path), "--dry-run"]) == 0
+    listed = capsys.readouterr().out
+    assert listed.count("to do") == 2 and "--set alpha=0.3" in listed and not (tmp_path / "runs").exists()
+    assert cli.main(["sweep", str(path), "--record", "tiny"]) == 0, capsys.readouterr().out
+    table, curves = pd.read_csv(results / "tiny.csv"), pd.read_csv(results / "tiny_curves.csv")
+    assert list(table.recipe) == ["alpha=0.1", "alpha=0.3"] and (table.env_steps >= 600).all() and (table.episodes == 2).all()
+    assert list(table.sweep) == ["pdkit sweep spec.json --record tiny"] * 2  # no folder of this machine
+    assert table.command[1] == ("pdkit train decorated Door --method policy_decorator --profile smoke --recipe alpha=0.3 --episodes 2 "
+                                "--seeds 0 --set alpha=0.3")
+    assert set(curves.recipe) == set(table.recipe) and curves.success_once.notna().sum() == 2
+    assert read_json(results / "tiny_manifest.json")["again"] == ["pdkit sweep spec.json --record tiny"]
+    assert (results / "tiny.png").exists()
+    capsys.readouterr()
+    monkeypatch.setattr(Local, "start", None)  # nothing may start again
+    assert cli.main(["sweep", str(path), "--dry-run"]) == 0 and capsys.readouterr().out.count("finished") == 2
+    assert cli.main(["sweep", str(path), "--record", "tiny"]) == 0
+    assert "2 jobs, 2 finished, 0 to do" in capsys.readouterr().out and len(pd.read_csv(results / "tiny.csv")) == 2
+    # What ran with another recipe than the profile's of today is not passed off as the same.
+    one = sweep.make_jobs(sweep.load_spec(path))[0]
+    result = read_json(one.result)
+    write_json(one.result, result | {"settings": result["settings"] | {"gamma": 0.5, "eval_workers": 9}})
+    assert cli.main(["sweep", str(path)]) == 2
+    assert "with other values of gamma than" in capsys.readouterr().err
+
+
+def test_a_training_that_fails_is_told_with_its_own_sentence_and_the_other_is_kept(tmp_path, results, capsys, monkeypatch):
+    path = written(tmp_path)
+    broken, fine = sweep.make_jobs(sweep.load_spec(path))
+    folder = broken.folder / "run" / "Door-alpha=0.1-seed0"
+    write_json(folder / "manifest.json", {"kind": "decorated", "parameters": {"alpha": 0.9}})  # another run is in the way
+
+    def run(one):
+        return {"row": {}, "curve": []} if one == fine else sweep_run.run_job(one)
+
+    class Here(Local):  # the same job function, in this process
+        def start(self, function, one):
+            try:
+                write_json(one.result, sweep_run.work(run, one))
+            except PdkitError as error:
+                return str(error)
+            return ""
+
+        def ended(self, handles, timeout):
+            return list(handles)
+
+        def problem(self, handle, one):
+            return handle
+
+        def stop(self, handles):
+            assert not handles
+
+    monkeypatch.setattr(sweep, "Local", Here)
+    assert cli.main(["sweep", str(path)]) == 1
+    last = capsys.readouterr().out.splitlines()[-1]
+    assert last.startswith("FAILED Door alpha=0.1 seed 0: ") and "holds another run" in last and last.endswith("log.txt)")
+    assert fine.result.exists() and not broken.result.exists()
+
+
+def test_ctrl_c_is_told_with_what_is_kept_and_records_nothing(tmp_path, results, capsys, monkeypatch):
+    def interrupted(jobs, *_):
+        write_json(jobs[0].result, {"row": {}, "curve": [], "seconds": 1.0})
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(sweep, "run_jobs", interrupted)
+    assert cli.main(["sweep", str(written(tmp_path)), "--record", "tiny"]) == 130
+    assert "1 of 2 jobs are finished and kept" in capsys.readouterr().out and not results.exists()
+
+
+def test_the_same_sweep_does_not_run_twice_at_once(tmp_path, results, capsys):
+    with sweep._alone("tiny"):
+        assert cli.main(["sweep", str(written(tmp_path))]) == 2
+    assert "is running already" in capsys.readouterr().err
+
+
+def test_a_notebook_is_run_with_each_value_and_its_result_becomes_a_row(tmp_path, results, monkeypatch):
+    books = ROOT / "notebooks"
+    end = "from pdkit import nb\nnb.finish({'seen': word * 2, 'part': {'total': sum(list) + seed}, 'all': list}, out)"
+    cells = [nbformat.v4.new_code_cell('profile = "smoke"  # p\nout = ""  # o\nseed = 0  # s\nword = "x"  # w\nlist = [0]  # l'),
+             nbformat.v4.new_code_cell(end)]
+    cells[0].metadata["tags"] = ["parameters"]
+    name = f"tmp_sweep_{os.getpid()}"
+    path = books / f"{name}.ipynb"
+    try:
+        nbformat.write(nbformat.v4.new_notebook(cells=cells), path)
+        spec = written(tmp_path, **BOOK | {"fixed": {"notebook": name, "list": [2, 3]}, "grid": {"word": ["a b", "1"]}, "seeds": [4],
+                                           "cells": [{"word": "c", "recipe": "c"}]})
+        assert cli.main(["sweep", str(spec)]) == 2  # a blank in a name
+        spec = written(tmp_path, **BOOK | {"fixed": {"notebook": name, "list": [2, 3]}, "grid": None, "seeds": [4],
+                                           "cells": [{"word": "a b", "recipe": "ab"}, {"word": "1", "recipe": "one"}]})
+        assert cli.main(["sweep", str(spec), "--record", "book"]) == 0
+    finally:
+        path.unlink()
+    table = pd.read_csv(results / "book.csv", dtype=str)
+    assert list(table.seen) == ["a ba b", "11"] and list(table["part.total"]) == ["9", "9"] and list(table.seed) == ["4", "4"]
+    assert "all" not in table and not (results / "book_curves.csv").exists() and nb.notebooks().get(name) is None
+
+
+# ---- Ray -------------------------------------------------------------------------------------------------------------
+
+@pytest.mark.parametrize("words", [["--ray"], ["--address", "10.0.0.1:6379"]])
+def test_a_missing_ray_is_one_clear_sentence(tmp_path, monkeypatch, capsys, words):
+    monkeypatch.setattr(sweep_ray, "find_spec", lambda name: None)
+    assert cli.main(["sweep", str(written(tmp_path)), *words]) == 2
+    assert capsys.readouterr().err == ("Ray is not installed; run `pip install ray`, or leave out --ray and --address to use local "
+                                       "workers.\n")
+
+
+def test_the_same_jobs_on_ray_fail_alone_too(tmp_path, monkeypatch):
+    pytest.importorskip("ray")
+    path = filter(None, (str(Path(__file__).parent), os.environ.get("PYTHONPATH")))  # where Ray's workers find `play`
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(path))
+    jobs = [job(tmp_path, "a", value=3), job(tmp_path, "b", fail=True), job(tmp_path, "c", die=True), job(tmp_path, "d", value=5)]
+    backend = sweep_ray.Ray(None, 2)
+    assert backend.limit == 2
+    problems = sweep.sweep(jobs, backend, backend.limit, play)
+    assert problems["T b seed 0"] == "It broke; mend it." and "worker was lost" in problems["T c seed 0"] and len(problems) == 2
+    assert read_json(jobs[3].result)["row"] == {"value": 5}

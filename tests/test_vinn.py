@@ -1,0 +1,150 @@
+"""VINN: the lookup by hand, FISH's exclusion buffer, features of a trained Behavior Transformer, training and the way to disk."""
+import json
+import shutil
+
+import numpy as np
+import pytest
+import torch
+from test_policies import line_demos
+from worlds import clone, reach_demos
+
+from pdkit import train
+from pdkit.demos.sources import bundled
+from pdkit.errors import PdkitError
+from pdkit.imitate import ImitateConfig, Windows, imitate
+from pdkit.policies import MLP, VINN, BeT, load_policy, save_policy
+
+TINY = dict(window=3, bins=4, layers=1, heads=2, embed=16, features=8, dropout=0.3)
+
+
+def lookup(**config):
+    """Three remembered points on a line (raw, unscaled): at 0, 1 and 3, with actions 0, 0.5 and -1."""
+    policy = VINN({"obs_dim": 1, "act_dim": 1} | config)
+    policy.remember(torch.tensor([0.0, 1.0, 3.0])[:, None, None].expand(-1, policy.window, 1), torch.tensor([[0.0], [0.5], [-1.0]]))
+    return policy.eval()
+
+
+def act(policy, *points):
+    return policy.act(np.array(points, np.float32)[:, None, None])[:, 0, 0]
+
+
+def test_one_neighbour_copies_its_action():
+    assert act(lookup(k=1), 0.1, 0.6, 1.9, 2.1, 9.0).tolist() == [0.0, 0.5, 0.5, -1.0, -1.0]
+
+
+def test_more_neighbours_are_weighted_by_the_softmax_of_minus_their_distances():
+    w = np.exp(-0.25) / (np.exp(-0.25) + np.exp(-0.75))
+    assert act(lookup(k=2), 0.25) == pytest.approx([(1 - w) * 0.5])
+    far, near = np.exp(-1.5), np.exp(-0.5)  # of 2.5: the points at 1 and 3
+    assert act(lookup(k=2), 2.5) == pytest.approx([(far * 0.5 - near) / (far + near)])
+    weights = np.exp(-np.array([0.5, 0.5, 2.5]))
+    assert act(lookup(k=3), 0.5) == pytest.approx([weights @ [0.0, 0.5, -1.0] / weights.sum()])
+
+
+def test_distances_are_in_normalised_units():
+    policy = VINN({"obs_dim": 2, "act_dim": 1, "k": 1})
+    observations = np.array([[0, 0], [1, 300], [0, 100]], np.float32)
+    policy.fit_statistics(np.concatenate([observations, -observations]), None)
+    policy.remember(torch.from_numpy(observations[:, None]), torch.tensor([[0.0], [0.5], [-1.0]]))
+    assert policy.act(np.array([[[0.9, 190.0]]], np.float32)).item() == 0.5  # unscaled, (0, 100) would be nearer
+
+
+def test_demonstrated_observations_give_back_their_actions():
+    demos = line_demos(4, 12)
+    policy, history = imitate("vinn", demos, ImitateConfig(eval_episodes=0), dict(k=1))
+    assert policy.config["rows"] == 48 and [row["iteration"] for row in history] == [0]
+    for episode in demos.episodes():
+        assert np.allclose(policy.act(episode["observations"][:-1, None])[:, 0], episode["actions"])
+
+
+def test_exclusion_passes_over_what_came_up_too_often():
+    """One place in the buffer, one visit tolerated: row 0, then it is out; row 1 once, then 1 is out too (and nothing is left, so the
+    last candidate), which lets 0 in again."""
+    policy = lookup(k=1, exclusion=1, tolerance=1, history=5)
+    stuck = 0.1 + 0.01 * np.arange(5)
+    windows = np.stack([np.concatenate([np.full(7 - t, stuck[0]), stuck[1:t]]) for t in range(1, 5)])[..., None].astype(np.float32)
+    assert windows.shape == (4, 6, 1) and policy.window == 6
+    assert policy.act(windows)[:, 0, 0].tolist() == [0.0, 0.5, 0.5, 0.0]
+    twice = lookup(k=1, exclusion=1, tolerance=2, history=5)
+    assert twice.act(windows)[:, 0, 0].tolist() == [0.0, 0.0, 0.5, 0.5]
+    longer = lookup(k=1, exclusion=2, tolerance=1, history=5)  # three candidates, of which none is left at the fourth
+    assert longer.act(windows)[:, 0, 0].tolist() == [0.0, 0.5, -1.0, -1.0]
+
+
+def test_the_start_of_an_episode_is_no_decision():
+    """The repeated first observation is not a place where the policy has been stuck, whatever the length of the windows."""
+    demos = reach_demos(6)
+    bet = clone(BeT, demos, TINY, iterations=1)
+    plain, excluding = (remembered(demos, bet, k=1, **more) for more in ({}, dict(exclusion=3, history=4)))
+    first = np.stack([e["observations"][0] for e in demos.episodes()])[:, None] + 0.01
+    assert np.array_equal(plain.act(np.repeat(first, 3, axis=1)), excluding.act(np.repeat(first, 7, axis=1)))
+
+
+def remembered(demos, bet=None, folder=None, **config):
+    if bet is not None and folder is None:
+        config["representation"] = bet.config
+    elif folder is not None:
+        save_policy(bet, folder)
+        config["representation"] = str(folder)
+    policy = VINN({"obs_dim": 4, "act_dim": 2} | config)
+    if bet is not None and folder is None:
+        policy.gpt.load_state_dict(bet.gpt.state_dict())
+        policy.normalizer.load_state_dict(bet.normalizer.state_dict())
+    policy.fit_statistics(demos.observations, demos.actions)
+    policy.remember(*Windows(demos, policy.window, True).all())
+    return policy.eval()
+
+
+def test_features_of_a_trained_behavior_transformer(tmp_path):
+    demos = reach_demos(6)
+    bet = clone(BeT, demos, TINY | dict(act_dropout=True), iterations=30)
+    bet.normalizer.mean += 1.0  # it must be this one, not one fitted anew
+    policy = remembered(demos, bet, tmp_path / "bet", k=1)
+    windows, actions = Windows(demos, 3, True).all()
+    expected = BeT(bet.config | {"act_dropout": False}).eval()
+    expected.load_state_dict(bet.state_dict())
+    with torch.no_grad():
+        wanted = expected.gpt(expected.normalizer(windows))[:, -1]
+    assert policy.window == 3 and torch.allclose(policy.library, wanted, atol=1e-5) and torch.equal(policy.actions, actions)
+    assert np.allclose(policy.train().act(windows.numpy())[:, 0], actions)  # no dropout, even while something trains
+
+
+def test_save_and_load_needs_no_other_folder(tmp_path):
+    demos = reach_demos(6)
+    policy = remembered(demos, clone(BeT, demos, TINY, iterations=30), tmp_path / "bet", k=3)
+    save_policy(policy, tmp_path / "vinn")
+    shutil.rmtree(tmp_path / "bet")
+    again = load_policy(tmp_path / "vinn")
+    x = np.random.default_rng(0).normal(size=(20, 3, 4)).astype(np.float32)
+    assert isinstance(again, VINN) and np.array_equal(again.act(x), policy.act(x))
+    assert sorted(p.name for p in (tmp_path / "vinn").iterdir()) == ["policy.json", "weights.safetensors"]
+    assert str(tmp_path) not in (tmp_path / "vinn" / "policy.json").read_text()
+    card = json.loads((tmp_path / "vinn" / "policy.json").read_text())
+    card["config"]["rows"] -= 1
+    (tmp_path / "vinn" / "policy.json").write_text(json.dumps(card))
+    with pytest.raises(PdkitError, match="train it again"):
+        load_policy(tmp_path / "vinn")
+
+
+def test_made_by_the_command(tmp_path):
+    out = tmp_path / "v"
+    assert train.main(["base", "Door", "--policy", "vinn", "--num-demos", "2", "--out", str(out), "--set", "k=2", "eval_episodes=0"]) == 0
+    policy = load_policy(out)
+    assert policy.config["k"] == 2 and policy.config["rows"] == bundled("Door").first(2).lengths.sum()
+
+
+def test_bad_configurations_are_told(tmp_path):
+    with pytest.raises(PdkitError, match="k=1"):
+        lookup(k=2, exclusion=3)
+    with pytest.raises(PdkitError, match="at least 1"):
+        lookup(k=0)
+    with pytest.raises(PdkitError, match="as many demonstrated steps"):
+        lookup(k=4)
+    with pytest.raises(PdkitError, match="no demonstrations"):
+        act(VINN({"obs_dim": 1, "act_dim": 1}), 0.0)
+    save_policy(MLP({"obs_dim": 1, "act_dim": 1, "hidden": 4}), tmp_path / "mlp")
+    with pytest.raises(PdkitError, match="kind bet, not mlp"):
+        lookup(representation=str(tmp_path / "mlp"))
+    save_policy(BeT({"obs_dim": 4, "act_dim": 2} | TINY), tmp_path / "bet")
+    with pytest.raises(PdkitError, match="same task"):
+        lookup(representation=str(tmp_path / "bet"))
