@@ -55,6 +55,7 @@ def test_returns_of_a_success_and_of_a_failure():
     solved, failed = rows_of([-1, -1, 0], stop=True), rows_of([-1, -1, -1], stop=False)
     assert solved["mc"] == [-1.5, -1.0, 0.0]
     assert failed["mc"] == [-2.0, -2.0, -2.0]  # r_neg / (1 - gamma), not the sum of three
+    assert rows_of([-1, 1], stop=True)["mc"] == [-0.5, 1.0]  # nothing comes after a success, whatever it pays
     assert solved["reward"] == [-1.5, -1.0, 0.0] and failed["reward"] == [-1.5, -1.5, -1.0]
     assert solved["discount"] == [0.25, 0.0, 0.0] and failed["discount"] == [0.25, 0.25, 0.5]
     assert solved["next_obs"] == [2, 3, 3] and solved["next_base"] == [20, 30, 30]
@@ -176,12 +177,15 @@ def test_updates_of_the_loop_come_on_top_of_the_offline_ones():
     assert trainer.agent.updates == 60 + int((1000 - 4 - 500) * 0.25)
 
 
-def test_the_offline_stage_is_evaluated_but_not_selected():
+def test_the_offline_stage_is_evaluated_but_not_selected(monkeypatch):
+    from pdkit import online_eval
+
+    given = iter([1.0, 0.2])
+    monkeypatch.setattr(online_eval, "_score", lambda *_: {"success_once": next(given), "success_at_end": 0.0})
     trainer, _ = run("calql_c", total_steps=600, eval_every=600, eval_episodes=3)
     offline = [row for row in trainer.rows if row["step"] == 0]
     assert "success_once" in offline[-1] and not any("success_once" in row for row in offline[:-1])
-    last = trainer.rows[-1]
-    assert trainer.best_score == (last["success_once"] + last["success_at_end"]) / 2
+    assert offline[-1]["success_once"] == 1.0 and trainer.best_score == 0.1
 
 
 def test_rollouts_keep_failures():

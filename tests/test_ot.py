@@ -213,7 +213,8 @@ def test_an_unfinished_episode_scale_and_features_survive():
 
 @pytest.mark.parametrize("method", ["fish", "rot"])
 def test_what_training_stores(method, beside, bet_sac):
-    t = trainer(method, vinn(beside, k=1) if method == "fish" else bet_sac, total_steps=528, warmup_steps=100, utd=0.0, n_step=1)  # ends within episodes
+    base = vinn(beside, k=1) if method == "fish" else bet_sac
+    t = trainer(method, base, total_steps=528, warmup_steps=100, utd=0.0, n_step=1)  # ends within episodes
     finished = []
     judge = t.reward.__class__.__call__
     t.reward.__class__ = type("Watched", (OTReward,), {"__call__": lambda self, o: finished.append((o, judge(self, o))) or finished[-1][1]})
@@ -379,13 +380,13 @@ def test_fish_learns_from_demonstrations_what_nearest_neighbours_miss(beside):
     """No success is ever rewarded; the base misses by more than is allowed and the residual may correct just enough."""
     base = vinn(beside, k=3)
     assert success(base) < 0.3
-    policy = trainer("fish", base, total_steps=2500).train()
+    policy = trainer("fish", base, total_steps=1600).train()
     assert success(policy) > 0.8
 
 
 def test_rot_learns_from_demonstrations_what_the_base_policy_misses(bet_sac):
     assert success(bet_sac) < 0.2
-    policy = trainer("rot", bet_sac, total_steps=3000).train()
+    policy = trainer("rot", bet_sac, total_steps=2000).train()
     assert success(policy) > 0.7
 
 
