@@ -11,7 +11,8 @@ from matplotlib.patches import Patch
 from .plots import COLORS, Picture, blank, styled
 from .stats import Rate
 
-ARMS = {"random critic": "#d1495b", "critic alone": "#e0a030", "critic learns": "#3c3c46", "decorated": COLORS["decorated"]}
+ARMS = {"random critic": "#d1495b", "critic alone": "#e0a030", "critic learns": "#3c3c46",
+        "decorated, pushed": "#6aaed6", "decorated": COLORS["decorated"]}
 OTHERS = ("#2c9f6b", "#8f5fb0", "#b07a3c", "#7d7d7d")  # for arms without a colour of their own
 
 
@@ -20,13 +21,13 @@ def directions_figure(cosines: Sequence[np.ndarray], dim: int, sizes: dict[str, 
     """Left: the distribution of cosines between each critic's pull and the improvement, and that of random directions in `dim`
     dimensions. Right: the mean size of named pushes on an action."""
     figure, axes = blank(1, 2, (9.2, 3.4), width_ratios=[2.2, 1])
-    ax, edges = axes[0, 0], np.linspace(-0.8, 0.8, 49)
+    ax, edges = axes[0, 0], np.linspace(-0.8, 0.8, 25)
     middle = (edges[1:] + edges[:-1]) / 2
     density = (1 - middle**2) ** ((dim - 3) / 2)  # of the cosine between two random directions
     ax.fill_between(middle, density / density.sum(), color="#dddddd", label="random directions")
     for i, values in enumerate(cosines):
         counts, _ = np.histogram(np.clip(values, -0.799, 0.799), edges)
-        ax.step(middle, counts / len(values), where="mid", color=ARMS["random critic"], lw=1.2, alpha=0.8,
+        ax.plot(middle, counts / len(values), color=ARMS["random critic"], lw=1.2, alpha=0.8,
                 label=f"each of {len(cosines)} random critics" if i == 0 else None)
         ax.axvline(values.mean(), 0, 0.05, color=ARMS["random critic"], lw=2)
     ax.axvline(0, color="black", lw=0.8)
@@ -56,12 +57,12 @@ def drift_figure(drifts: pd.DataFrame, *, bound: float, distance: float) -> Pict
     for name, rows in drifts.groupby("arm", sort=False):
         ax.plot(rows["update"], rows.drift, "-o", ms=3.5, color=ARMS.get(name, OTHERS[0]), label=name)
     right = drifts["update"].max()
-    notes = ((distance, "distance to the better policy", "#888888"), (bound, f"bound alpha = {bound:g}", COLORS["decorated"]))
-    for y, text, color in notes:
-        ax.annotate(text, (right, y), (-2, 3), textcoords="offset points", ha="right", color=color, fontsize=8.5)
+    ax.annotate(f"bound alpha = {bound:g}", (right, bound), (-2, 3), textcoords="offset points", ha="right", color=COLORS["decorated"],
+                fontsize=8.5)
+    ax.annotate("distance to the better policy", (0, distance), (3, 3), textcoords="offset points", color="#888888", fontsize=8.5)
     ax.set(xlabel="updates of the actor", ylabel="mean |a - a0| per joint", xlim=(0, right * 1.02), ylim=(0, None))
     ax.set_title("How far the policy has drifted")
-    figure.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=9)
+    figure.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=5, fontsize=9)
     return figure
 
 
@@ -99,7 +100,8 @@ def warm_figure(rows: pd.DataFrame, *, warmup: int, bound: float, target: float)
         ax.set_title(title)
     axes[0, 0].set_ylim(0, None)
     axes[0, 1].axhline(target, color="black", ls=":", lw=1.2)
-    axes[0, 1].annotate("target", (0, target), (4, 3), textcoords="offset points", fontsize=8.5)
+    axes[0, 1].annotate("target", (rows["update"].max(), target), (-3, -11), textcoords="offset points", ha="right",
+                        fontsize=8.5)
     axes[0, 2].axhspan(-bound, 0, color=COLORS["both"], lw=0)
     axes[0, 2].annotate("what rewards alone can be worth", (rows["update"].max(), 0), (-3, -11), textcoords="offset points", ha="right",
                         fontsize=8)
@@ -108,15 +110,15 @@ def warm_figure(rows: pd.DataFrame, *, warmup: int, bound: float, target: float)
 
 
 @styled
-def interventions_figure(arms: pd.DataFrame, *, bound: float) -> Picture:
-    """A row for each arm whose actor is frozen (columns arm, kind, gap, size, growth, q), sorted by the side of the target; red: the
-    temperature rises. Side, size of log pi, temperature and Q beside each other; green strip: what rewards alone can be worth."""
+def interventions_figure(arms: pd.DataFrame) -> Picture:
+    """A row for each arm whose actor is frozen (columns arm, kind, gap, size, growth, loss), sorted by the side of the target; red: the
+    temperature rises. Side, size of log pi, temperature and the critics' loss beside each other."""
     arms = arms.sort_values("gap", ascending=False, ignore_index=True)
     figure, axes = blank(1, 4, (11.4, 1.3 + 0.3 * len(arms)), sharey=True)
     rises = arms.growth > 1
     colors = np.where(rises, COLORS["lost"], COLORS["gained"])
-    titles = {"gap": "Side of the target", "size": "Size of log pi", "growth": "Temperature", "q": "Q"}
-    labels = ("target entropy - entropy", "mean |log pi| at the start", "last / first", "|mean Q| at the end")
+    titles = {"gap": "Side of the target", "size": "Size of log pi", "growth": "Temperature", "loss": "Loss of Q"}
+    labels = ("target entropy - entropy", "mean |log pi| at the start", "last / first", "at the end")
     for ax, (column, title), label in zip(axes[0], titles.items(), labels, strict=True):
         start = 1.0 if column == "growth" else 0.0
         ax.barh(arms.index, arms[column] - start, 0.68, left=start, color=colors)
@@ -124,11 +126,9 @@ def interventions_figure(arms: pd.DataFrame, *, bound: float) -> Picture:
         ax.set(xlabel=label)
         ax.set_title(title)
         ax.grid(axis="y", visible=False)
-    axes[0, 3].axvspan(0, bound, color=COLORS["both"], lw=0, zorder=0)
-    axes[0, 3].set_xscale("symlog", linthresh=bound)
+    axes[0, 3].set_xscale("symlog", linthresh=1)
     axes[0, 0].set_yticks(arms.index, [f"{row.kind}: {row.arm}" for row in arms.itertuples()])
     axes[0, 0].set_ylim(len(arms) - 0.4, -0.6)
-    handles = [Patch(color=COLORS["lost"], label="temperature rises"), Patch(color=COLORS["gained"], label="temperature falls"),
-               Patch(color=COLORS["both"], label="what rewards alone can be worth")]
-    figure.legend(handles=handles, loc="outside lower center", ncols=3, fontsize=9)
+    handles = [Patch(color=COLORS["lost"], label="temperature rises"), Patch(color=COLORS["gained"], label="temperature falls")]
+    figure.legend(handles=handles, loc="outside lower center", ncols=2, fontsize=9)
     return figure

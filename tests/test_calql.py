@@ -275,6 +275,7 @@ def test_killed_and_resumed_gives_the_same_curve(tmp_path, method, where, bet_sa
 
     with pytest.raises(KeyboardInterrupt):
         fresh().train(Run(tmp_path / "cut", "online", config), killed)
+    assert Run(tmp_path / "cut", "online", config).has_checkpoint  # of the offline stage too
     resumed = fresh()
     resumed.train(Run(tmp_path / "cut", "online", config))
     strip = lambda rows: [{k: v for k, v in row.items() if "seconds" not in k} for row in rows]  # noqa: E731

@@ -94,10 +94,12 @@ def from_agent(policy: Policy, task: str, num: int, *, first_seed: int, noise: f
 
 
 def rollouts(policy: Policy, spec: TaskSpec, seeds: Sequence[int], limit: int | None = None) -> Demos:
-    """Whole episodes of a policy, one a seed and in that order, successes and failures alike: what a learner must not only imitate."""
+    """Whole episodes of a policy, one a seed, successes and failures alike: what a learner must not only imitate.
+
+    They run to the time limit (`limit`, or the task's), so they end in the order of the seeds.
+    """
     policy.reset(seeds[0])
     episodes = [e for ended in _play(policy, spec, seeds, min(len(seeds), 10), limit=limit) for e in ended]
-    episodes.sort(key=lambda e: seeds.index(e["seed"]))
     return from_episodes(spec.name, episodes, label="agent", how=f"{type(policy).__name__} without action noise, failures kept",
                          command="pdkit.demos.sources.rollouts", spec=spec)
 
