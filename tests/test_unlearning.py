@@ -45,12 +45,14 @@ def test_a_starting_point_has_data_and_an_untouched_actor(policy, tuning, window
     assert unlearning.drift(tuning.agent.actor, windows, policy.act(windows)[:, 0]) < 1e-6
 
 
-def test_a_fresh_learner_repeats_the_actor_and_varies_the_critic(tuning):
+@pytest.mark.parametrize("name", ["tuning", "residual"])
+def test_a_fresh_learner_repeats_the_actor_and_varies_the_critic(name, request):
+    tuning = request.getfixturevalue(name)
     first, again, other = unlearning.fresh(tuning, 0), unlearning.fresh(tuning, 0), unlearning.fresh(tuning, 1, init_temperature=0.5)
     weights = [torch.cat([p.flatten() for p in agent.critics.parameters()]) for agent in (first, again, other)]
     assert torch.equal(weights[0], weights[1]) and not torch.equal(weights[0], weights[2])
-    for name, tensor in tuning.agent.actor.state_dict().items():
-        assert torch.equal(other.actor.state_dict()[name], tensor)
+    for key, tensor in tuning.agent.actor.state_dict().items():
+        assert torch.equal(other.actor.state_dict()[key], tensor)
     assert math.isclose(float(other.log_temperature.detach().exp()), 0.5, rel_tol=1e-5)
     with pytest.raises(PdkitError, match="settings of SAC"):
         unlearning.fresh(tuning, 0, lerning_rate=1.0)
