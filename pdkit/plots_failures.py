@@ -59,7 +59,8 @@ def drift_figure(drifts: pd.DataFrame, *, bound: float, distance: float) -> Pict
     right = drifts["update"].max()
     ax.annotate(f"bound alpha = {bound:g}", (right, bound), (-2, 3), textcoords="offset points", ha="right", color=COLORS["decorated"],
                 fontsize=8.5)
-    ax.annotate("distance to the better policy", (0, distance), (3, 3), textcoords="offset points", color="#888888", fontsize=8.5)
+    ax.annotate("distance to the better policy", (right, distance), (-2, -12), textcoords="offset points", ha="right", color="#888888",
+                fontsize=8.5)
     ax.set(xlabel="updates of the actor", ylabel="mean |a - a0| per joint", xlim=(0, right * 1.02), ylim=(0, None))
     ax.set_title("How far the policy has drifted")
     figure.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=5, fontsize=9)
