@@ -72,7 +72,7 @@ def load_decorated(folder: str | Path) -> Decorated:
     try:
         actor = Actor(**card["actor"])
         actor.load_state_dict(load_file(weights))
-        config = DecoratorConfig(**card["decorator"] | {"alpha_scale": tuple(card["decorator"]["alpha_scale"])})
+        config = DecoratorConfig(**card["decorator"] | {"alpha_scale": tuple(card["decorator"].get("alpha_scale", ()))})
     except (SafetensorError, RuntimeError, TypeError, KeyError) as error:
         raise PdkitError(f"{folder} does not hold the actor that its decorated.json describes; train it again.") from error
     return Decorated(load_policy(folder / "base"), actor.eval(), config, bool(card["normalize"]))

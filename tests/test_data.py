@@ -1,4 +1,5 @@
 """The bundled data: complete, unaltered, labelled, and what the lessons say they are."""
+import numpy as np
 import pandas as pd
 import pytest
 
@@ -39,6 +40,12 @@ def test_checkpoints_load_and_fit_the_task(task):
     # the decorated policy holds the very base policy that is shipped beside it
     for ours, theirs in zip(base.state_dict().values(), decorated.base.state_dict().values(), strict=True):
         assert ours.equal(theirs)
+
+
+@pytest.mark.parametrize("card", sorted((DATA / "checkpoints").rglob("decorated.json")), ids=lambda path: "-".join(path.parts[-3:-1]))
+def test_every_decorated_checkpoint_loads(card):
+    policy = load_decorated(card.parent)
+    assert np.isfinite(policy.act(np.zeros((2, policy.window, policy.base.config["obs_dim"]), np.float32))).all()
 
 
 def test_the_main_jobs_evidence_has_a_row_a_seed_and_a_command_each():
