@@ -13,7 +13,10 @@ SPEC is a TOML (or JSON) file:
     alpha = [0.1, 0.3]
     [[cells]]                 # further cells, over the fixed values
     critic_input = "concat"
-    recipe = "critic concat"  # optional: what a cell is called; by default the values in which it differs
+    recipe = "critic-concat"  # optional: what a cell is called; by default the values in which it differs
+    seeds = [0]               # optional: its own seeds
+
+All cells run with the first seed, then all with the next: a sweep that is stopped early compares them on fewer seeds.
 
 A training's values are the options of `pdkit train decorated` (task, method, profile, episodes, base, demos, num_demos) and
 any field of its configuration; a notebook's are `notebook` and its parameters. Paths are relative to the project's folder.
@@ -85,12 +88,13 @@ def load_spec(path: str | Path) -> Spec:
     if values.get("kind") not in KINDS:
         raise unknown(f"kind in {path.name}", values.get("kind", ""), KINDS)
     seeds, minutes = values.get("seeds", [0]), values.get("minutes")
-    if not seeds or any(type(s) is not int or s < 0 for s in seeds) or len(set(seeds)) < len(seeds):
-        raise PdkitError(f"{path.name}: seeds must be different whole numbers of 0 or more, not {seeds!r}.")
     if minutes is not None and (isinstance(minutes, bool) or not isinstance(minutes, int | float) or minutes <= 0):
         raise PdkitError(f"{path.name}: minutes must be a number above 0, not {minutes!r}.")
     name = values.get("name", path.stem)
     cells = _cells(path.name, name, values.get("fixed", {}), values.get("grid", {}), values.get("cells", []))
+    for given in (seeds, *(cell["seeds"] for cell in cells if "seeds" in cell)):
+        if not isinstance(given, list) or not given or any(type(s) is not int or s < 0 for s in given) or len(set(given)) < len(given):
+            raise PdkitError(f"{path.name}: seeds must be different whole numbers of 0 or more, not {given!r}.")
     return Spec(path, name, values["kind"], tuple(seeds), cells, values.get("record", ""), minutes)
 
 
@@ -118,15 +122,15 @@ def _cells(file: str, name: str, fixed: dict[str, Any], grid: dict[str, Any], fu
         raise PdkitError(f"{file}: cells must be a list of tables.")
     varied = [dict(zip(grid, values, strict=True)) for values in itertools.product(*grid.values())] if grid else []
     varied += further or ([] if grid else [{}])
-    for values in (fixed, *varied):
-        if "seed" in values:
+    for values in (fixed, grid, *varied):
+        if "seed" in values or (values in (fixed, grid) and "seeds" in values):
             raise PdkitError(f"{file}: give seeds at the top (seeds = [0, 1]), not seed among the values.")
     return tuple({"recipe": _recipe(cell, name)} | fixed | cell for cell in varied)
 
 
 def _recipe(cell: dict[str, Any], name: str) -> str:
     """What a cell is called: the values in which it differs."""
-    parts = [str(value) if key == "method" else f"{key}={value}" for key, value in cell.items() if key not in ("task", "notebook")]
+    parts = [str(value) if key == "method" else f"{key}={value}" for key, value in cell.items() if key not in ("task", "notebook", "seeds")]
     return ",".join(parts) or name
 
 
@@ -135,7 +139,9 @@ def _recipe(cell: dict[str, Any], name: str) -> str:
 def make_jobs(spec: Spec) -> list[Job]:
     """Every job, each checked as the command itself would: nothing runs before all are known to be right."""
     make = {"train": _training, "notebook": _notebook}[spec.kind]
-    jobs = [make(spec, dict(cell), seed) for cell in spec.cells for seed in spec.seeds]
+    every = dict.fromkeys([*spec.seeds, *(seed for cell in spec.cells for seed in _seeds(spec, cell))])
+    jobs = [make(spec, {name: value for name, value in cell.items() if name != "seeds"}, seed)
+            for seed in every for cell in spec.cells if seed in _seeds(spec, cell)]
     seen: dict[str, Job] = {}
     for job in jobs:
         if not isinstance(job.labels["recipe"], str) or not RECIPE.fullmatch(job.labels["recipe"]):
@@ -146,6 +152,10 @@ def make_jobs(spec: Spec) -> list[Job]:
                 raise PdkitError(f"The cells {seen[mark].labels['recipe']} and {job.labels['recipe']} {what}.")
             seen[mark] = job
     return jobs
+
+
+def _seeds(spec: Spec, cell: dict[str, Any]) -> Sequence[int]:
+    return cell.get("seeds", spec.seeds)
 
 
 def _training(spec: Spec, cell: dict[str, Any], seed: int) -> Job:

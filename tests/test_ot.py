@@ -104,6 +104,22 @@ def test_the_same_path_costs_nothing_and_the_mirrored_one_more():
     assert len(slow) == 8
 
 
+def test_all_of_the_demonstration_must_be_covered():
+    """Transport, not the nearest neighbour: one half of the episode may carry a third to its like and must carry a sixth elsewhere, at
+    cost 1; standing still where the demonstration starts costs the mean distance to all of it."""
+    values = reward([arc(0, 90, 90)], iterations=1000)
+    values.scale = 1.0
+    assert np.allclose(values(arc(0, 90)), [-1 / 6, 0], atol=1e-3) and values.error < 1e-3
+    assert values(arc(0, 0, 0, 0)).sum() == pytest.approx(-2 / 3, abs=0.01)
+
+
+def test_a_hundred_iterations_may_hide_what_an_episode_owes():
+    """The trap of ROT's numbers, with the case above: the sixth is not yet moved, the reward is near 0, and `error` is what tells."""
+    values = reward([arc(0, 90, 90)])
+    values.scale = 1.0
+    assert abs(values(arc(0, 90)).sum()) < 1e-3 and values.error > 0.4
+
+
 def test_first_observations_do_not_count():
     """No action led to them."""
     path, values = arc(0, 20), reward([arc(0, 20)])

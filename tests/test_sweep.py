@@ -154,11 +154,19 @@ def test_cells_are_the_grid_and_the_further_ones_by_each_seed(tmp_path):
                    cells=[{"critic_input": "concat"}, {"recipe": "other", "method": "residual_rl"}])
     jobs = sweep.make_jobs(sweep.load_spec(path))
     assert len(jobs) == (2 * 2 + 2) * 2 and len({one.folder for one in jobs}) == 12
-    assert [one.labels["recipe"] for one in jobs[::2]] == [
+    assert [one.labels["recipe"] for one in jobs] == 2 * [
         "alpha=0.1,H=0", "alpha=0.1,H=100", "alpha=0.3,H=0", "alpha=0.3,H=100", "critic_input=concat", "other"]
-    assert jobs[1].command == ("pdkit train decorated Door --method policy_decorator --profile smoke --recipe alpha=0.1,H=0 --episodes 2 "
+    assert jobs[6].command == ("pdkit train decorated Door --method policy_decorator --profile smoke --recipe alpha=0.1,H=0 --episodes 2 "
                                "--seeds 1 --set alpha=0.1 H=0")
     assert jobs[-1].config["alpha"] == 1.0 and jobs[0].minutes == expected_minutes(online_config("Door", "smoke", alpha=0.1, H=0), 2)
+
+
+def test_a_cell_may_have_its_own_seeds(tmp_path):
+    path = written(tmp_path, seeds=[1, 0], cells=[{"critic_input": "concat", "seeds": [0]}, {"critic_input": "residual", "seeds": [3, 0]}])
+    jobs = sweep.make_jobs(sweep.load_spec(path))
+    assert [(one.labels["recipe"], one.labels["seed"]) for one in jobs] == [
+        ("alpha=0.1", 1), ("alpha=0.3", 1), ("alpha=0.1", 0), ("alpha=0.3", 0), ("critic_input=concat", 0), ("critic_input=residual", 0),
+        ("critic_input=residual", 3)]
 
 
 def test_a_toml_file_says_the_same_as_a_json_file(tmp_path):
@@ -192,6 +200,8 @@ def test_the_folder_follows_every_parameter_and_nothing_else(tmp_path):
     ({"grid": {"alpha": []}}, "grid holds lists"),
     ({"grid": {"episodes": [1]}}, "given in fixed and in grid"),
     ({"grid": {"seed": [1]}}, "give seeds at the top"),
+    ({"fixed": {"seeds": [1]}}, "give seeds at the top"),
+    ({"cells": [{"alpha": 0.5, "seeds": [1, 1]}]}, "seeds must be different"),
     ({"cells": [3]}, "cells must be a list of tables"),
     ({"fixed": {"task": "Dor"}}, "Did you mean 'Door'?"),
     ({"fixed": {}}, "a training needs a task"),
@@ -235,12 +245,20 @@ def test_bad_options_are_refused(tmp_path, capsys, words, said):
     assert said in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("name, cells", [("leaderboard", 6), ("ablations", 15)])
-def test_the_specs_of_the_recorded_results_are_right(name, cells):
+@pytest.mark.parametrize("name", [path.stem for path in sorted((DATA / "sweeps").glob("*.toml"))])
+def test_the_specs_of_the_recorded_results_are_right(name):
+    """Each is recorded under its name, and compares on one task with one budget, the same evaluations and at least three seeds."""
     spec = sweep.load_spec(DATA / "sweeps" / f"{name}.toml")
     jobs = sweep.make_jobs(spec)
-    assert spec.name == spec.record == name and len(jobs) == 5 * cells
-    assert all(one.config["total_steps"] == 40_000 and one.parameters["episodes"] == 200 for one in jobs)
+    assert spec.name == spec.record == name
+    seeds = {}
+    for one in jobs:
+        seeds.setdefault((one.labels["task"], one.labels["recipe"]), []).append(one.labels["seed"])
+    assert all(len(own) >= 3 and own == [*range(len(own))] for own in seeds.values())
+    if spec.kind == "train":
+        for task in {one.labels["task"] for one in jobs}:
+            budgets = {(one.config["total_steps"], one.parameters["episodes"]) for one in jobs if one.labels["task"] == task}
+            assert len(budgets) == 1
 
 
 # ---- real jobs -------------------------------------------------------------------------------------------------------

@@ -9,7 +9,7 @@ Traps (facts.md 3.1). The reward is imitation alone: success is not in it. One e
 a demonstration, all others cost much. An episode's mass is 1 however long it is, so a step of a long one weighs less.
 phi must not move under the reward: it is a frozen copy. Rewards exist only when an episode is over, so its transitions are held
 back. With epsilon 0.01 a hundred iterations may not converge: each o_i still moves its whole mass 1/T (Sinkhorn updates the rows
-last), but some o^e_j get more or less than 1/T'; `error` says how much.
+last), but some o^e_j get more or less than 1/T', and a cost that is due can be missing altogether; `error` says how much.
 """
 from __future__ import annotations
 
