@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 
 from .errors import PdkitError
+from .smoothness import Motions
 from .tasks.lanes import IDLE
 from .tasks.spec import TaskSpec
 from .tasks.vector import VectorEnv
@@ -22,7 +23,7 @@ def timed(act: Actor) -> Actor:
 
 def evaluate(spec: TaskSpec, actor: Actor, seeds: Sequence[int], *, window: int = 1, chunk: int = 1, num_envs: int = 10,
              workers: int = 0, max_episode_steps: int | None = None, progress: Callable[[int, int], None] | None = None) -> pd.DataFrame:
-    """One row a seed, in the order of `seeds`: seed, success_once, success_at_end, length.
+    """One row a seed, in the order of `seeds`: seed, success_once, success_at_end, length, action_change, jerk (see smoothness.py).
 
     Episodes run to the time limit whether or not they are solved (a success can be lost again), and each of the seeds is
     counted: stopping at the first n episodes to finish would favour short, successful ones (facts.md 1.5, trap 4).
@@ -38,11 +39,15 @@ def evaluate(spec: TaskSpec, actor: Actor, seeds: Sequence[int], *, window: int 
     with VectorEnv(spec, num_envs, lambda lane: queue.pop() if queue else IDLE, window=window, chunk=chunk, workers=workers,
                    max_episode_steps=max_episode_steps) as envs:
         windows = envs.reset()
+        motions = Motions(spec, windows)
         while len(rows) < len(seeds):
-            result = envs.step(actor(windows, elapsed) if getattr(actor, "timed", False) else actor(windows))
+            actions = actor(windows, elapsed) if getattr(actor, "timed", False) else actor(windows)
+            result = envs.step(actions)
+            motions.add(actions, result.steps, result.final_windows)
             windows, elapsed = result.windows, np.where(result.done, 0, elapsed + result.steps)
             for e in result.episodes:
-                rows[e.seed] = dict(seed=e.seed, success_once=e.success_once, success_at_end=e.success_at_end, length=e.length)
+                rows[e.seed] = dict(seed=e.seed, success_once=e.success_once, success_at_end=e.success_at_end, length=e.length,
+                                    **motions.end(e.lane, windows[e.lane]))
             if result.episodes and progress:
                 progress(len(rows), len(seeds))
     return pd.DataFrame([rows[s] for s in seeds])

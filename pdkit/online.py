@@ -16,7 +16,7 @@ import torch
 from torch import nn
 
 from .decorated import Decorated, save_decorated
-from .decorator import compose, gate, gate_probability
+from .decorator import compose, gate, gate_probability, scaled
 from .demos.format import Demos
 from .errors import PdkitError
 from .online_config import OnlineConfig, lr_factor, stops
@@ -59,6 +59,8 @@ class Trainer:
             raise PdkitError("demo_fraction is above 0 but no demonstrations were given; pass demos or set demo_fraction=0.")
         self.nstep = self._make_nstep(config.num_envs)
         self.step, self.train_seconds, self.rows, self.recent = 0, 0.0, [], []
+        self.sizes = np.zeros(3)  # since the last row: sums over decisions of |residual|, of |base action|, and their number
+        self.first_reward = 0  # the step by which the first reward came; 0: none yet
         self.episode_counts = [0] * config.num_envs
         self.log: dict[str, torch.Tensor] = {}
         self.best_score, self.best_actor = -1.0, {}  # of the evaluations so far
@@ -152,6 +154,7 @@ class Trainer:
                 before = self.step
                 residual = self._explore(self._view(windows), base)
                 envs.send(compose(c.decorator, base, residual)[:, None])
+                self.sizes += np.abs(scaled(c.decorator, residual)).mean(1).sum(), np.abs(base).mean(1).sum(), len(base)
                 self._learn()
                 result = envs.receive()
                 base_next, base_final = self._base_actions(result)
@@ -159,6 +162,7 @@ class Trainer:
                 windows, base = result.windows, base_next
                 self.step += int(result.steps.sum())
                 self.recent += result.episodes
+                self.first_reward = self.first_reward or self.step * bool(result.reward.any())
                 if self._row_is_due(before):
                     self._add_row(before, evaluations)
                     if progress:
@@ -257,6 +261,9 @@ class Trainer:
         if episodes:
             values |= {"train_success": float(np.mean([e.success_once for e in episodes])), "train_episodes": len(episodes),
                        "train_length": float(np.mean([e.length for e in episodes]))}
+        if self.sizes[2]:  # as executed: bounded by alpha, 0 where the gate was shut
+            values |= {"residual_size": self.sizes[0] / self.sizes[2], "base_size": self.sizes[1] / self.sizes[2]}
+        self.sizes = np.zeros(3)
         return {"step": self.step, "updates": self.agent.updates, "seconds": self.train_seconds,
                 "gate": gate_probability(self.config.decorator, self.step), **values}
 
@@ -278,7 +285,7 @@ class Trainer:
         arrays |= {f"unscored.{step}/{k}": v.numpy() for step, weights in unscored.items() for k, v in weights.items()}
         values = {"step": self.step, "train_seconds": self.train_seconds, "position": self.replay.position, "rows": self.rows,
                   "best_score": self.best_score, "rng": self.rng.bit_generator.state, "recent": [vars(e) for e in self.recent],
-                  "log": {k: float(v) for k, v in self.log.items()}}
+                  "sizes": self.sizes.tolist(), "first_reward": self.first_reward, "log": {k: float(v) for k, v in self.log.items()}}
         run.save_checkpoint(arrays, values)
 
     def load(self, run: Run) -> dict[str, np.ndarray]:
@@ -299,6 +306,7 @@ class Trainer:
         self.episode_counts = arrays["episode_counts"].tolist()
         self.step, self.train_seconds, self.rows = values["step"], values["train_seconds"], values["rows"]
         self.recent = [Episode(**e) for e in values["recent"]]
+        self.sizes, self.first_reward = np.array(values["sizes"]), values["first_reward"]
         self.log = {k: torch.tensor(v) for k, v in values["log"].items()}
         self.best_score, self.best_actor = values["best_score"], {k: torch.from_numpy(v) for k, v in group("best").items()}
         for key, tensor in group("unscored").items():

@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import ast
 import dataclasses
+import math
 import os
 import sys
 from dataclasses import asdict
@@ -182,11 +183,17 @@ def decorate(config, base: Policy, demos: Demos | None, out: Path, episodes: int
             tables[name].to_csv(temporary, index=False)
     row = dict(task=config.task, method=config.method, policy=base.kind, seed=config.seed,
                train_minutes=round(trainer.train_seconds / 60, 2), cores=describe_machine()["cores"], env_steps=trainer.step,
+               first_reward_step=trainer.first_reward or None,
                updates=trainer.agent.updates, episodes=episodes,
-               base_success=round(float(tables["base"].success_once.mean()), 4),
-               base_success_at_end=round(float(tables["base"].success_at_end.mean()), 4),
-               decorated_success=round(float(tables["decorated"].success_once.mean()), 4),
-               decorated_success_at_end=round(float(tables["decorated"].success_at_end.mean()), 4),
+               **_outcome("base", tables["base"]), **_outcome("decorated", tables["decorated"]),
                load_average=round(os.getloadavg()[0], 1) if hasattr(os, "getloadavg") else None)
     run.finish(**row)
     return row, tables["base"]
+
+
+def _outcome(name: str, table: pd.DataFrame) -> dict[str, float | None]:
+    """Means over the test episodes, as columns of the row."""
+    means = table[["success_once", "success_at_end", "action_change", "jerk"]].mean()
+    jerk = None if math.isnan(means.jerk) else round(means.jerk, 1)
+    return {f"{name}_success": round(means.success_once, 4), f"{name}_success_at_end": round(means.success_at_end, 4),
+            f"{name}_action_change": round(means.action_change, 4), f"{name}_jerk": jerk}

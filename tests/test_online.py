@@ -100,6 +100,19 @@ def test_the_gate_holds_for_learned_residuals_and_what_is_stored_is_what_was_exe
     assert np.allclose(rows["next_obs"][:, :2], np.clip(rows["obs"][:, :2] + 0.2 * executed, -1.5, 1.5), atol=1e-5)
 
 
+def test_rows_tell_how_large_residual_and_base_action_were_since_the_row_before():
+    c = config(n_step=1, total_steps=1200, log_every=400, eval_every=0, decorator=DecoratorConfig(alpha=0.6, H=3000), on_success="continue")
+    trainer = Trainer(c, biased_base(), spec=SPEC)
+    trainer.train()
+    stored = columns(trainer)
+    edges = [0, *(row["step"] for row in trainer.rows)]
+    for low, high, row in zip(edges, edges[1:], trainer.rows, strict=False):
+        assert row["residual_size"] == pytest.approx(0.6 * np.abs(stored["residual"][low:high]).mean(), rel=1e-5)
+        assert row["base_size"] == pytest.approx(np.abs(stored["base"][low:high]).mean(), rel=1e-5)
+    first = np.flatnonzero(stored["reward"] > c.reward_shift)[0]
+    assert trainer.first_reward == c.num_envs * (first // c.num_envs + 1)  # all environments step together
+
+
 def test_actor_and_learner_see_observations_through_the_base_policys_normaliser():
     base = biased_base()
     base.normalizer.mean.fill_(0.5)

@@ -77,18 +77,18 @@ def _make(env_id: str, render: bool):
     return env
 
 
-def _spec(name: str, obs_dim: int, act_dim: int, limit: int, success_rule: str, summary: str) -> TaskSpec:
+def _spec(name: str, obs_dim: int, joints: int, act_dim: int, limit: int, success_rule: str, summary: str) -> TaskSpec:
     return TaskSpec(
         name=name, suite="adroit", obs_dim=obs_dim, act_dim=act_dim, max_episode_steps=limit,
         control="absolute joint targets, scaled to [-1, 1]", success_rule=success_rule, absolute_actions=True,
-        make=partial(AdroitSim, f"AdroitHand{name}-v1"), summary=summary,
+        make=partial(AdroitSim, f"AdroitHand{name}-v1"), summary=summary, joints=joints, rate=100.0,
     )
 
 
 ADROIT_TASKS = (
-    _spec("Door", 39, 28, 300, "door hinge >= 1.35 rad", "Undo the latch and swing the door open."),
-    _spec("Pen", 45, 24, 200, "pen within 0.075 m of the goal and axes aligned (cosine > 0.95)",
+    _spec("Door", 39, 27, 28, 300, "door hinge >= 1.35 rad", "Undo the latch and swing the door open."),
+    _spec("Pen", 45, 24, 24, 200, "pen within 0.075 m of the goal and axes aligned (cosine > 0.95)",
           "Turn a pen in the hand until it matches the goal pose."),
-    _spec("Hammer", 46, 26, 400, "nail head within 0.01 m of its goal", "Pick up a hammer and drive a nail home."),
-    _spec("Relocate", 39, 30, 400, "ball within 0.1 m of the target", "Carry a ball to a target in the air."),
+    _spec("Hammer", 46, 26, 26, 400, "nail head within 0.01 m of its goal", "Pick up a hammer and drive a nail home."),
+    _spec("Relocate", 39, 30, 30, 400, "ball within 0.1 m of the target", "Carry a ball to a target in the air."),
 )

@@ -294,5 +294,7 @@ MANISKILL_TASKS = (
         absolute_actions=False,
         make=StackCube,
         summary="A Panda arm must put the red cube on the green one and let go.",
+        joints=9,
+        rate=20.0,
     ),
 )

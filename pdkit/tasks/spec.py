@@ -41,3 +41,5 @@ class TaskSpec:
     absolute_actions: bool  # actions are targets (pad a chunk by repeating the last), not deltas (pad with zeros)
     make: Callable[..., Sim]  # make(render=False) -> Sim
     summary: str = ""  # one sentence for people
+    joints: int = 0  # the first so many numbers of an observation are the robot's joint positions
+    rate: float = 1.0  # primitive steps a second
