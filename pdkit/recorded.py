@@ -12,6 +12,7 @@ import matplotlib.pyplot as plt
 import pandas as pd
 from matplotlib.figure import Figure
 
+from .errors import PdkitError
 from .files import DATA, atomic_file, write_json
 from .runs import describe_machine
 from .stats import wilson
@@ -39,6 +40,21 @@ def record(name: str, rows: pd.DataFrame, curves: pd.DataFrame) -> None:
             return
         with atomic_file(folder / f"{name}.png") as temporary:
             figure(*tables, "Door" if "Door" in set(tables[0].task) else str(rows.task.iloc[0])).savefig(temporary, dpi=130)
+
+
+def load(name: str, task: str | None = None) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Recorded rows (one a run) and learning curves (empty where there are none) of data/results/NAME, of all tasks or one.
+
+    Raises PdkitError when nothing is recorded.
+    """
+    path, curves = DATA / "results" / f"{name}.csv", DATA / "results" / f"{name}_curves.csv"
+    table = pd.read_csv(path) if path.exists() else pd.DataFrame(columns=KEYS)
+    table = table if task is None else table[table.task == task]
+    if table.empty:
+        raise PdkitError(f"No results {name!r}{f' of {task}' if task else ''} are recorded in data/results; "
+                         f"`pdkit sweep data/sweeps/{name}.toml` makes them.")
+    lines = pd.read_csv(curves) if curves.exists() else pd.DataFrame(columns=[*KEYS, "step"])
+    return table.reset_index(drop=True), lines[lines.task.isin(table.task)].reset_index(drop=True)
 
 
 @contextlib.contextmanager
