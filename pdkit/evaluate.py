@@ -21,6 +21,11 @@ def timed(act: Actor) -> Actor:
     return act
 
 
+def ask(act: Actor, windows: np.ndarray, elapsed: np.ndarray) -> np.ndarray:
+    """Action chunks (N, chunk, act_dim) for windows (N, window, obs_dim), the time told to those that depend on it."""
+    return act(windows, elapsed) if getattr(act, "timed", False) else act(windows)
+
+
 def evaluate(spec: TaskSpec, actor: Actor, seeds: Sequence[int], *, window: int = 1, chunk: int = 1, num_envs: int = 10,
              workers: int = 0, max_episode_steps: int | None = None, progress: Callable[[int, int], None] | None = None) -> pd.DataFrame:
     """One row a seed, in the order of `seeds`: seed, success_once, success_at_end, length, action_change, jerk (see smoothness.py).
@@ -41,7 +46,7 @@ def evaluate(spec: TaskSpec, actor: Actor, seeds: Sequence[int], *, window: int 
         windows = envs.reset()
         motions = Motions(spec, windows)
         while len(rows) < len(seeds):
-            actions = actor(windows, elapsed) if getattr(actor, "timed", False) else actor(windows)
+            actions = ask(actor, windows, elapsed)
             result = envs.step(actions)
             motions.add(actions, result.steps, result.final_windows)
             windows, elapsed = result.windows, np.where(result.done, 0, elapsed + result.steps)

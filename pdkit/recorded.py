@@ -57,6 +57,19 @@ def load(name: str, task: str | None = None) -> tuple[pd.DataFrame, pd.DataFrame
     return table.reset_index(drop=True), lines[lines.task.isin(table.task)].reset_index(drop=True)
 
 
+def by_arm(table: pd.DataFrame, group: str, field: str, name: str) -> pd.DataFrame:
+    """A notebook's recorded rows, whose columns are called GROUP.ARM.FIELD, as one row an arm and seed: recipe (the arm), seed, `name`.
+
+    Raises PdkitError when there is no such column.
+    """
+    arms = {column: column.removeprefix(f"{group}.").removesuffix(f".{field}") for column in table
+            if column.startswith(f"{group}.") and column.endswith(f".{field}")}
+    if not arms:
+        raise PdkitError(f"These results have no columns {group}.ARM.{field}; they come from another notebook.")
+    rows = table.set_index("seed")[list(arms)].rename(columns=arms).stack()
+    return rows.rename_axis(["seed", "recipe"]).rename(name).reset_index()[["recipe", "seed", name]]
+
+
 @contextlib.contextmanager
 def _alone(name: str) -> Iterator[None]:
     """Wait until no other process records: two trainings that end together must not lose each other's rows."""

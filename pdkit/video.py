@@ -10,7 +10,7 @@ import functools
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -21,6 +21,7 @@ import pandas as pd
 from .decorated import Decorated
 from .decorator import compose, scaled
 from .errors import PdkitError
+from .evaluate import Actor, ask
 from .files import atomic_file
 from .machine import MUJOCO_DRAWS
 from .plots import COLORS, Picture, blank, styled
@@ -38,8 +39,6 @@ CAMERAS = {
     "Hammer": {"distance": 0.9, "azimuth": 45.0, "elevation": -30.0, "lookat": np.array([0.0, -0.1, 0.2])},
     "Relocate": {"distance": 1.1, "azimuth": 60.0, "elevation": -30.0, "lookat": np.array([0.0, -0.1, 0.25])},
 }
-
-Actor = Callable[[np.ndarray], np.ndarray]  # windows (N, window, obs_dim) -> action chunks (N, chunk, act_dim)
 
 
 @dataclass(frozen=True)
@@ -136,7 +135,7 @@ def record(spec: TaskSpec, actor: Actor, seed: int, *, window: int = 1, steps: i
         if pictures:
             frames, taken = [sim.render()], [0]
         while len(success) < limit:
-            for action in np.clip(actor(history[None])[0], -1, 1)[: limit - len(success)]:
+            for action in np.clip(ask(actor, history[None], np.array([len(success)]))[0], -1, 1)[: limit - len(success)]:
                 observation, solved = sim.step(action)
                 success.append(solved)
                 history = np.concatenate([history[1:], observation[None]])

@@ -14,6 +14,7 @@ from matplotlib.colors import to_hex
 from pdkit import page, plots, stats, video
 from pdkit.demos.format import Demos
 from pdkit.errors import PdkitError
+from pdkit.evaluate import timed
 from pdkit.files import ROOT
 from pdkit.tasks import get_task
 from pdkit.tasks.spec import TaskSpec
@@ -160,6 +161,19 @@ def test_record_gives_the_policy_its_window_and_plays_whole_chunks():
     assert seen == [[0, 0, 0], [1, 2, 3]] and clip.length == 5 and clip.frames == []
     # Clipped, and cut at the limit.
     assert [float(a[0]) for a in Counter.last.actions] == pytest.approx([0.1, 1, -1, 0.1, 1])
+
+
+def test_record_tells_a_policy_the_time_that_asks_for_it():
+    """Such as JSRL's, whose guide takes the first steps."""
+    seen = []
+
+    @timed
+    def act(windows, elapsed):
+        seen.append(elapsed.tolist())
+        return np.zeros((1, 2, 1), np.float32)
+
+    video.record(COUNTER, act, 9, steps=5, pictures=False)
+    assert seen == [[0], [2], [4]]
 
 
 def test_never_solved(clip):
