@@ -8,6 +8,7 @@ data/results/claims.csv has a row a claim:
               untested one, the paper's tasks    verdict   reproduced, partly, not or untested
                                                  command   that makes the numbers again
 
+`pdkit report --update` first computes every verdict anew for which there is a rule (pdkit/verdicts.py) and enough is recorded.
 A claim whose verdict is not "untested" has all of them. The recorded tables beside it (a row a run, with its command) are checked
 too: a report on broken tables is refused.
 """
@@ -21,10 +22,10 @@ from pathlib import Path
 
 import pandas as pd
 
-from . import page
+from . import page, verdicts
 from .cli import Parser
 from .errors import PdkitError
-from .files import DATA, runs_root
+from .files import DATA, atomic_file, runs_root
 from .recorded import KEYS
 
 COLUMNS = ["claim", "section", "tasks", "seeds", "measured", "interval", "verdict", "command"]
@@ -137,11 +138,16 @@ def sections(claims: pd.DataFrame, tables: dict[str, pd.DataFrame], folder: Path
 
 
 def main(argv: list[str]) -> int:
-    """`pdkit report [--out FILE]`; 1 when something in the claims or the tables is wrong, which is then listed."""
+    """`pdkit report [--update] [--out FILE]`; 1 when something in the claims or the tables is wrong, which is then listed."""
     parser = Parser(prog="pdkit report", description="List the paper's claims with what was measured, and write a page.")
     parser.add_argument("--out", help="the page (default: runs/report.html)")
+    parser.add_argument("--update", action="store_true", help="write the verdicts into data/results/claims.csv that its tables support")
     args = parser.parse_args(argv)
     folder = DATA / "results"
+    if args.update:
+        claims = verdicts.updated(load_claims(folder / "claims.csv"))
+        with atomic_file(folder / "claims.csv") as temporary:
+            claims.to_csv(temporary, index=False)
     claims, tables = load_claims(folder / "claims.csv"), recorded_tables(folder)
     problems = claim_problems(claims)
     for name, table in tables.items():

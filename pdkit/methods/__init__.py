@@ -25,6 +25,9 @@ class Method:
 # No base action is added and nothing is gated; acting is the actor's own business from the first step.
 _OWN_POLICY = dict(alpha=1.0, alpha_scale=(), H=0, residual_penalty=0.0)
 
+# A transformer as the actor: at batch 256 an update costs a core 0.4 s, twenty times a residual's, and a lesson would take an hour.
+_TRANSFORMER = dict(batch=64)
+
 # PPO learns from its own policy alone, with the learning rate falling from the start (as in cleanrl) and a spread that starts at 0.6
 # (cleanrl: 1; the lesson's 0.2 is enough for SAC, whose entropy term raises it)
 _ON_POLICY = dict(warmup="policy", warmup_steps=0, demo_fraction=0.0, lr_decay_from=0.0, log_std_range=(-3.0, 2.0))
@@ -45,13 +48,13 @@ METHODS: dict[str, Method] = {
         "SAC from scratch", "Haarnoja et al. 2018; appendix C.1; facts.md 4.2: no base policy and no demonstrations",
         changes=_OWN_POLICY | dict(warmup="uniform", demo_fraction=0.0), trainer="pdkit.methods.scratch:Scratch"),
     "sac_finetune": Method(
-        "SAC fine-tuning", "appendix B.4.1; facts.md 2.3", changes=_OWN_POLICY | dict(warmup="policy", demo_fraction=0.0), base="bet-sac",
-        trainer="pdkit.methods.finetune:FineTune"),
+        "SAC fine-tuning", "appendix B.4.1; facts.md 2.3", changes=_OWN_POLICY | dict(warmup="policy", demo_fraction=0.0),
+        lesson=_TRANSFORMER, base="bet-sac", trainer="pdkit.methods.finetune:FineTune"),
     "rlpd_paper": Method(
         "RLPD as in the paper", "appendix B.5; facts.md 3.2: LayerNorm critics and half of each batch from demonstrations, on fine-tuning; "
         "ensemble and high UTD left out",
-        changes=_OWN_POLICY | dict(warmup="policy", demo_fraction=0.5, critic_layer_norm=True),
-        base="bet-sac", trainer="pdkit.methods.finetune:FineTune"),
+        changes=_OWN_POLICY | dict(warmup="policy", demo_fraction=0.5, critic_layer_norm=True), lesson=_TRANSFORMER, base="bet-sac",
+        trainer="pdkit.methods.finetune:FineTune"),
     "rlpd": Method(
         "RLPD, the original", "Ball et al. 2023, Adroit command; facts.md 3.2: 10 critics, least of 2, no entropy in the target, UTD 20, "
         "from scratch with demonstrations",
