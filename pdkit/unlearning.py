@@ -11,7 +11,7 @@ from __future__ import annotations
 import contextlib
 import copy
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -31,7 +31,9 @@ from .rl.networks import Actor
 from .rl.replay import Replay
 from .rl.sac import SAC
 from .stats import Paired
+from .tasks.lanes import IDLE
 from .tasks.spec import TaskSpec
+from .tasks.vector import VectorEnv
 
 # ---- a learner and what it learns from -------------------------------------------------------------------------------
 
@@ -86,6 +88,11 @@ def held_out(demos: Demos, window: int, count: int, *, skip: int, seed: int = 0)
     return windows[np.random.default_rng(seed).permutation(len(windows))[:count]].numpy()
 
 
+def lifted(observations: np.ndarray) -> np.ndarray:
+    """StackCube: whether the red cube is off the table, (M,) bool: its centre lies 2 cm above where it rests (half a cube, 2 cm)."""
+    return observations[:, 34] > 0.04
+
+
 def drift(policy: Policy | Decorated, windows: np.ndarray, reference: np.ndarray) -> float:
     """mean |a - a_0| per action dimension, `reference` (N, act_dim) being the actions a_0 of the policy where it started."""
     return float(np.abs(np.clip(policy.act(windows)[:, 0], -1, 1) - np.clip(reference, -1, 1)).mean())
@@ -113,6 +120,21 @@ def cosines(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """The cosine of the angle between rows, (N,); 0 where one of them is zero."""
     norms = np.linalg.norm(first, axis=1) * np.linalg.norm(second, axis=1)
     return np.where(norms > 0, (first * second).sum(axis=1) / np.maximum(norms, 1e-12), 0.0)
+
+
+def reached(spec: TaskSpec, policy: Policy | Decorated, seeds: Sequence[int], stage: Callable[[np.ndarray], np.ndarray], *,
+            limit: int | None = None) -> np.ndarray:
+    """Whether each seed's episode ever came to a stage, (N,) bool: `stage` maps observations (M, obs_dim) to (M,) bool."""
+    policy.reset(0)
+    queue = [*seeds][::-1]
+    with VectorEnv(spec, len(seeds), lambda lane: queue.pop() if queue else IDLE, window=policy.window, max_episode_steps=limit) as envs:
+        windows, found, running = envs.reset(), np.zeros(len(seeds), bool), np.ones(len(seeds), bool)
+        while running.any():
+            result = envs.step(policy.act(windows))
+            found |= running & stage(result.final_windows[:, -1])
+            running &= ~result.done
+            windows = result.windows
+    return found
 
 
 class Gated:

@@ -76,6 +76,11 @@ def test_unlearning(tmp_path):
     assert (tmp_path / "success.png").exists() and not (tmp_path / "episode.png").exists()
 
 
+def test_unlearning_the_cube(tmp_path):
+    result = run("06", tmp_path, task="StackCube")
+    assert result["task"] == "StackCube" and result["lifted"].keys() > {"before", "random critic, 2", "decorated, 4"}
+
+
 def test_warm_start(tmp_path):
     result = run("07", tmp_path)
     assert result["verdict"] in ("reproduced", "partly", "not") and set(result["runs"]) == {"warm", "vanilla", "fixed"}

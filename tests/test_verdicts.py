@@ -123,14 +123,18 @@ def test_jerk_is_judged_as_a_ratio(results, start, recipe, limit, sign):
         assert f"{ratio:.2f} times" in found.measured
 
 
-def test_rows_of_notebooks_are_judged(results):
-    table = pd.DataFrame({"task": "06_unlearning", "seed": range(5), "success.before.value": [0.9, 1, 0.9, 1, 1],
-                          "success.random critic, 100.value": [0.5, 0.6, 0.4, 0.3, 0.9], "success.random critic, 200.value": 1.0,
+@pytest.mark.parametrize("success, lifted, verdicts_of", [([0.5, 0], [0.9, 0.1], ["reproduced", "reproduced"]),
+                                                          ([0.5, 0], [0.1, 0.0], ["partly", "reproduced"]),
+                                                          ([1, 1], [0.9, 0.9], ["partly", "not"])])
+def test_unlearning_the_cube(results, success, lifted, verdicts_of):
+    table = pd.DataFrame({"task": "StackCube", "seed": range(5), "success.before.value": [0.9, 1, 0.9, 1, 0.9], "lifted.before": 1.0,
+                          "success.random critic, 100.value": success[0], "success.random critic, 200.value": success[1],
+                          "lifted.random critic, 100": lifted[0], "lifted.random critic, 200": lifted[1],
                           "cosine_random": [0.01, -0.02, 0, 0.03, -0.01], "drift.random critic": 0.1})
     table.to_csv(results / "unlearning.csv", index=False)
-    found = {number: verdicts.find(CLAIMS.claim[CLAIMS.claim.str.startswith(f"After {number}")].item()) for number in (100, 200)}
-    assert found[100].verdict == "partly" and found[200].verdict == "not"  # on one task that the claim does not name
-    assert verdicts.find(CLAIMS.claim[CLAIMS.claim.str.startswith("Gradients of")].item()).verdict == "reproduced"
+    starts = ("After 100 updates", "After 200 updates", "Gradients of")
+    found = [verdicts.find(CLAIMS.claim[CLAIMS.claim.str.startswith(start)].item()).verdict for start in starts]
+    assert found == [*verdicts_of, "reproduced"]
 
 
 def test_the_shipped_claims_are_what_the_recorded_results_say():
