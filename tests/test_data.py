@@ -18,7 +18,7 @@ def test_every_bundled_file_has_the_recorded_checksum():
 
 
 def test_the_repository_stays_small():
-    assert sum(p.stat().st_size for p in data_files()) < 30e6
+    assert sum(p.stat().st_size for p in data_files()) < 60e6  # eight tasks are to come
 
 
 @pytest.mark.parametrize("task", SHIPPED)
