@@ -312,6 +312,18 @@ def _() -> Finding:
                    judged(turned(share), -0.5))
 
 
+@measures("The BeT modified for fine-tuning")
+def _() -> Finding:
+    """Like the original: the mean difference, with its interval, lies within 10 points (ours)."""
+    rows = _unlearning("Door")
+    ours, theirs = by_seed(rows, "x", "original.other.value"), by_seed(rows, "x", "original.base.value")
+    interval, values = difference(ours, theirs)
+    inside = -0.1 < interval.low and interval.high < 0.1
+    return finding("unlearning", values, f"modified {percent(ours.mean())}, original {percent(theirs.mean())}: "
+                   f"{100 * interval.value:+.1f} points", points(interval),
+                   "reproduced" if inside else "partly" if abs(interval.value) < 0.1 else "not", EIGHT)
+
+
 @measures("Gradients of a randomly initialised critic")
 def _() -> Finding:
     """Noise: the mean cosine with the direction that would help, over five random critics a run, does not differ from 0 by 0.1 (ours)."""

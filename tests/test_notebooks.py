@@ -74,6 +74,7 @@ def test_unlearning(tmp_path):
     assert 0 < result["drift"]["decorated"] < result["drift"]["decorated, pushed"] <= result["bound"] == 0.05
     assert result["success"]["before"]["value"] <= 1 and result["exercise_solved"] is False
     assert (tmp_path / "success.png").exists() and not (tmp_path / "episode.png").exists()
+    assert result["original"]["n"] == 2
 
 
 def test_unlearning_the_cube(tmp_path):
@@ -88,6 +89,14 @@ def test_warm_start(tmp_path):
     growth = {arm["arm"]: arm["growth"] for arm in result["interventions"]}
     assert growth["-9"] > 1 > growth["-1"] and result["cause"] == "side"
     assert (tmp_path / "updates.csv").exists() and result["exercise_solved"] is False
+
+
+def test_task_horizon(tmp_path):
+    result = run("10", tmp_path)
+    assert set(result["starts"]) == {"0", "0.9"} and result["starts"]["0.9"]["left"] < 10 < result["starts"]["0"]["left"]
+    assert result["starts"]["0"]["hinge"] < result["starts"]["0.9"]["hinge"] < 1.35
+    assert result["verdicts"]["propagation"] == "reproduced" and result["exercise_solved"] is False
+    assert (tmp_path / "exploration.png").exists() and not (tmp_path / "starts.png").exists()
 
 
 # ---- the main job ----------------------------------------------------------------------------------------------------
@@ -189,6 +198,10 @@ def test_exercises_accept_solutions_and_name_mistakes(capsys):
         (check.temperature_step, lambda x, h, t, lr: x - lr * (h - t), "solved"),
         (check.temperature_step, lambda x, h, t, lr: x + lr * (h - t), "sign"),
         (check.temperature_step, lambda x, h, t, lr: x - lr * (h + t), "negative already"),
+        (check.corridor_values, lambda n, g: g ** np.arange(n - 1, -1, -1.0), "solved"),
+        (check.corridor_values, lambda n, g: g ** np.arange(n), "wrong way round"),
+        (check.corridor_values, lambda n, g: g ** np.arange(n, 0, -1.0), "no discount"),
+        (check.corridor_values, lambda n, g: g ** (n - 1), "shape"),
     ]
     for judge, answer, expected in cases:
         assert judge(answer) == (expected == "solved")
