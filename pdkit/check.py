@@ -138,3 +138,21 @@ def temperature_step(answer: Callable, strict: bool = False) -> bool:
                 yield f"from {log_temperature:g} with entropy {entropy:g} it gives {got:.4f}, not {expected:.4f}."
 
     return _judge("temperature_step", complaints, strict)
+
+
+def corridor_values(answer: Callable, strict: bool = False) -> bool:
+    """10: exact values of a corridor's cells when only the step out of the last one is rewarded, with 1."""
+    def complaints() -> Iterator[str]:
+        for length, gamma in ((5, 0.9), (1, 0.5), (40, 0.97)):
+            expected = gamma ** np.arange(length - 1, -1, -1.0)
+            got = np.asarray(answer(length, gamma), float)
+            if got.shape != (length,):
+                yield f"for {length} cells it gives an array of shape {got.shape}, not {(length,)}."
+            if np.allclose(got, gamma * expected):
+                yield "the step out of the last cell brings its reward at once: no discount lies before it."
+            if length > 1 and np.allclose(got, expected[::-1]):
+                yield "it is the wrong way round: cell 0 is the farthest from the reward."
+            if not np.allclose(got, expected):
+                yield f"with gamma {gamma:g} the first of {length} cells is worth {expected[0]:.4f}, not {got[0]:.4f}."
+
+    return _judge("corridor_values", complaints, strict)

@@ -28,6 +28,7 @@ from .rl.sac import SAC
 from .runs import Run
 from .seeds import training_seed
 from .tasks import get_task
+from .tasks.horizon import horizon_spec, shortened
 from .tasks.spec import TaskSpec
 from .tasks.vector import Episode, VectorEnv
 from .torch_setup import pick_device
@@ -39,7 +40,8 @@ class Trainer:
     def __init__(self, config: OnlineConfig, base: Policy, demos: Demos | None = None, spec: TaskSpec | None = None):
         pick_device(config.device)  # an error where it is not there
         self.config, self.base = config, base.eval().to(config.device)
-        self.spec = spec or get_task(config.task)  # a spec of its own for worlds outside the registry, such as the probes
+        # A spec of its own is for worlds outside the registry, such as the probes; with start_fraction both become a shorter task.
+        self.spec = horizon_spec(spec or get_task(config.task), config.start_fraction)
         if base.chunk != 1:
             raise PdkitError("The online loop decorates policies that return one action at a time.")
         if base.config["obs_dim"] != self.spec.obs_dim or base.config["act_dim"] != self.spec.act_dim:
@@ -135,7 +137,7 @@ class Trainer:
         c = self.config
         envs = VectorEnv(self.spec, c.num_envs, self._next_seed, window=self.base.window, workers=c.env_workers,
                          terminate_on_success=c.on_success == "terminate", success_tail=c.success_tail,
-                         max_episode_steps=c.train_limit or None)
+                         max_episode_steps=shortened(c.train_limit, c.start_fraction) or None)
         with envs, contextlib.closing(self._evaluations()) as evaluations:
             windows, base = self._start(envs, run)
             for step, weights in sorted(self._unscored.items()):

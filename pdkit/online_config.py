@@ -33,6 +33,7 @@ class OnlineConfig:
     reward_shift: float = -1.0  # added to the sparse 0/1 reward of every decision
     train_limit: int = 0  # time limit of training episodes (0: the task's); shorter ones spend fewer steps on lost episodes
     on_success: str = "continue"  # training episodes go on when solved, or end ("terminate")
+    start_fraction: float = 0.0  # episodes start this far along a way to success, time limits shrink alike (pdkit/tasks/horizon.py); 0: not
     success_tail: int = 20  # those that go on are cut, as by a time limit, this many steps after the first success; 0: not
     bootstrap: str = "truncated"  # value of s' at an episode's end: only at time limits, never, or always
     normalize_obs: bool = True  # networks see observations through the base policy's normaliser (the paper's code: raw)
@@ -55,6 +56,8 @@ class OnlineConfig:
                 raise unknown(name, getattr(self, name), known)
         if not 0 <= self.demo_fraction < 1 or not 0 < self.gamma <= 1 or self.n_step < 1 or self.utd < 0 or self.batch < 2:
             raise PdkitError("The loop needs demo_fraction in [0, 1), gamma in (0, 1], n_step >= 1, utd >= 0 and batch >= 2.")
+        if not 0 <= self.start_fraction < 1:
+            raise PdkitError(f"start_fraction must be at least 0 and below 1, not {self.start_fraction}.")
         if self.seed < 0:
             raise PdkitError(f"The seed must be 0 or more, not {self.seed}.")
         if self.demo_fraction and 0 in self.decorator.alpha_scale:

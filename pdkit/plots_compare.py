@@ -4,11 +4,14 @@ A recipe keeps its colour in every figure of a notebook when both are given the 
 """
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+
 import matplotlib as mpl
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 
+from .errors import PdkitError
 from .plots import COLORS, Picture, _columns, _percent, blank, styled
 from .stats import iqm, stratified_bootstrap
 
@@ -123,3 +126,157 @@ def _values(ax: Axes, axis: str, column: str, label: str, log: bool) -> None:
         ax.xaxis.set_major_formatter(mpl.ticker.PercentFormatter(1.0, decimals=0))
     else:
         ax.set(**{f"{axis}label": label or column.replace("_", " "), f"{axis}scale": "log" if log else "linear"})
+
+
+# ---- many recipes ----------------------------------------------------------------------------------------------------
+
+@styled
+def panels_figure(curves: pd.DataFrame, panels: Mapping[str, Sequence[str]], *, column: str = "success_once",
+                  labels: dict[str, str] | None = None, reference: str = "", base: float | None = None,
+                  starts: Mapping[str, float] | None = None, own: pd.DataFrame | None = None, title: str = "") -> Picture:
+    """Learning curves of many recipes, a panel a family, all with the same axes: the mean over seeds in its 95 % bootstrap interval.
+
+    Args:
+        panels: panel title -> its recipes, of those in the curves.
+        reference: a recipe that every panel shows, in grey where it does not belong.
+        base: the base policy's value, dashed.
+        starts: recipe -> value at step 0, an open square before its curve.
+        own: the reader's own rows, dotted with open circles, in the panel that holds their recipe.
+    """
+    _columns(curves, "recipe", "seed", "step", column)
+    names = labelled(curves if own is None else pd.concat([curves, own]), labels)
+    color = colours(labels or names)
+    count = len(panels)
+    figure, axes = blank(-(-count // 2), min(count, 2), (9.6, 0.4 + 3.1 * -(-count // 2)), sharex=True, sharey=True)
+    for ax, (family, members) in zip(axes.flat, panels.items(), strict=False):
+        if reference and reference not in members:
+            _band(ax, curves, reference, column, "#9a9a9a", names.get(reference, reference))
+        for recipe in [r for r in names if r in members]:
+            _band(ax, curves, recipe, column, color[recipe], names[recipe])
+            if starts and recipe in starts:
+                ax.plot(0, starts[recipe], "s", ms=6, mfc="white", color=color[recipe], clip_on=False, zorder=4)
+            if own is not None and len(mine := own[(own.recipe == recipe) & own[column].notna()]):
+                ax.plot(mine.step, mine[column], ":o", ms=5, mfc="white", color=color[recipe], label=f"{names[recipe]}, your run")
+        if base is not None:
+            ax.axhline(base, color=COLORS["base"], ls="--", lw=1.2)
+        _values(ax, "y", column, "", False)
+        ax.xaxis.set_major_locator(mpl.ticker.MaxNLocator(5))
+        ax.xaxis.set_major_formatter(mpl.ticker.FuncFormatter(lambda x, _: f"{x:,.0f}"))
+        ax.set_title(family)
+        ax.legend(fontsize=8, loc="best")
+    for ax in axes.flat[count:]:
+        ax.set_visible(False)
+    for ax in axes[:, 1:].flat:
+        ax.set_ylabel("")
+    axes[0, 0].set_xlim(0, None)
+    figure.supxlabel("environment steps", fontsize=10)
+    figure.suptitle(title, x=0.01, ha="left", weight="bold", fontsize=12)
+    return figure
+
+
+def _band(ax: Axes, curves: pd.DataFrame, recipe: str, column: str, color: str, label: str) -> None:
+    """The mean over seeds at each evaluation, and its bootstrap interval where there are several seeds."""
+    rows = curves[(curves.recipe == recipe) & curves[column].notna()].sort_values("step")
+    if rows.empty:
+        return
+    rows = rows.assign(number=rows.groupby("seed").cumcount())  # seeds are logged a few steps apart: n-th belongs to n-th
+    step = rows.groupby("number").step.mean()
+    limits = [stratified_bootstrap(np.mean, values.to_numpy()[:, None], seed=BOOTSTRAP_SEED, repetitions=500)
+              for _, values in rows.groupby("number")[column]]
+    ax.plot(step, [i.value for i in limits], "-o", ms=3.5, color=color, label=f"{label} ({rows.seed.nunique()})")
+    ax.fill_between(step, [i.low for i in limits], [i.high for i in limits], color=color, alpha=0.15, lw=0)
+
+
+@styled
+def matrix_figure(values: pd.DataFrame, *, title: str = "", xlabel: str = "", ylabel: str = "", middle: float | None = None,
+                  percent: bool = True) -> Picture:
+    """A heat map of numbers in [0, 1], each written into its cell; NaN stays empty.
+
+    `middle`: the value that says nothing (0.5 for a probability of improvement), drawn white between red and blue; without it, the
+    more the bluer.
+    """
+    if values.empty:
+        raise PdkitError("This figure needs at least one row and one column.")
+    rows, columns = values.shape
+    figure, axes = blank(size=(2.6 + 0.62 * columns, 1.5 + 0.42 * rows))
+    ax, numbers = axes[0, 0], values.to_numpy(float)
+    scale = mpl.colors.TwoSlopeNorm(middle, 0, 1) if middle is not None else mpl.colors.Normalize(0, 1)
+    ax.imshow(numbers, cmap="RdBu" if middle is not None else "Blues", norm=scale, aspect="auto")
+    for (y, x), value in np.ndenumerate(numbers):
+        if np.isfinite(value):
+            dark = abs(scale(value) - 0.5) > 0.32 if middle is not None else value > 0.55
+            ax.text(x, y, f"{value:.0%}" if percent else f"{value:.2f}", ha="center", va="center", fontsize=8.5,
+                    color="white" if dark else "black")
+    tilted = dict(rotation=40, ha="right", rotation_mode="anchor") if columns > 5 else {}
+    ax.set_xticks(range(columns), [str(c) for c in values.columns], **tilted)
+    ax.set_yticks(range(rows), [str(r) for r in values.index])
+    ax.set(xlabel=xlabel, ylabel=ylabel)
+    ax.grid(visible=False)
+    ax.spines[:].set_visible(False)
+    ax.set_title(title)
+    return figure
+
+
+@styled
+def trade_figure(table: pd.DataFrame, *, x: str = "jerk", y: str = "success", labels: dict[str, str] | None = None,
+                 own: pd.DataFrame | None = None, title: str = "", xlabel: str = "") -> Picture:
+    """Two columns of the final policies against each other, such as jerk and success: a faint dot a run, a large one the mean.
+
+    The columns are called decorated_X and decorated_Y; base_X and base_Y of the policies that the methods start from are crosses,
+    named by the column `policy`. x is logarithmic. `own` holds the reader's rows, drawn as open circles.
+    """
+    wanted = [f"{who}_{what}" for who in ("base", "decorated") for what in (x, y)]
+    _columns(table, "recipe", "policy", *wanted)
+    table = table.dropna(subset=wanted)
+    if table.empty:
+        raise PdkitError(f"No run of this table has both {x} and {y}.")
+    names = labelled(table if own is None else pd.concat([table, own]), labels)
+    color = colours(labels or names)
+    figure, axes = blank(size=(8.6, 4.6))
+    ax = axes[0, 0]
+    for recipe, label in names.items():
+        rows = table[table.recipe == recipe]
+        ax.plot(rows[f"decorated_{x}"], rows[f"decorated_{y}"], "o", ms=4, color=color[recipe], alpha=0.35, mew=0)
+        if len(rows):
+            ax.plot(rows[f"decorated_{x}"].mean(), rows[f"decorated_{y}"].mean(), "o", ms=10, color=color[recipe], label=label)
+        if own is not None and len(mine := own[own.recipe == recipe].dropna(subset=wanted)):
+            ax.plot(mine[f"decorated_{x}"], mine[f"decorated_{y}"], "o", ms=11, mfc="none", color="black", label=f"{label}, your run")
+    for name, rows in table.groupby("policy"):
+        place = rows[f"base_{x}"].mean(), rows[f"base_{y}"].mean()
+        ax.plot(*place, "X", ms=10, color="black", mec="white", zorder=4)
+        ax.annotate(f"start: {name}", place, (7, -11), textcoords="offset points", fontsize=8.5)
+    ax.set_xscale("log")
+    ax.xaxis.set_major_formatter(mpl.ticker.FuncFormatter(lambda value, _: f"{value:,.3g}" if value < 1000 else f"{value:,.0f}"))
+    ax.xaxis.set_minor_formatter(mpl.ticker.NullFormatter())
+    _values(ax, "y", y, "success" if "success" in y else "", False)
+    ax.set_xlabel(xlabel or x.replace("_", " "))
+    ax.set_title(title)
+    figure.legend(loc="outside right upper", fontsize=8.5)
+    return figure
+
+
+@styled
+def differences_figure(rows: pd.DataFrame, *, colors: Mapping[str, str] | None = None, others: pd.DataFrame | None = None,
+                       title: str = "", xlabel: str = "points of success, against the reference") -> Picture:
+    """Differences with intervals, a row each (columns recipe, label, seeds, value, low, high; fractions, drawn as points).
+
+    `others` (recipe, value) are single differences of another origin, drawn as diamonds; colours tell the side of zero where
+    `colors` does not name them.
+    """
+    _columns(rows, "recipe", "label", "seeds", "value", "low", "high")
+    figure, axes = blank(size=(7.6, 1.2 + 0.42 * len(rows)))
+    ax = axes[0, 0]
+    ax.axvline(0, color="black", lw=1)
+    for y, row in enumerate(rows.iloc[::-1].itertuples()):
+        side = COLORS["gained"] if row.low > 0 else COLORS["lost"] if row.high < 0 else COLORS["base"]
+        color = (colors or {}).get(row.recipe, side)
+        ax.plot([100 * row.low, 100 * row.high], [y, y], color=color, lw=2.4)
+        ax.plot(100 * row.value, y, "o", ms=7, color=color)
+        if others is not None and len(single := others[others.recipe == row.recipe]):
+            ax.plot(100 * single.value, [y] * len(single), "D", ms=6, mfc="white", color="black")
+    ax.set_yticks(range(len(rows)), [f"{row.label} ({row.seeds})" for row in rows.iloc[::-1].itertuples()])
+    ax.set_ylim(-0.6, len(rows) - 0.4)
+    ax.grid(axis="y", visible=False)
+    ax.set(xlabel=xlabel)
+    ax.set_title(title)
+    return figure

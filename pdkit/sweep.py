@@ -240,6 +240,18 @@ def record_results(name: str, jobs: Sequence[Job], command: str) -> int:
     return len(results)
 
 
+def missing(jobs: Sequence[Job], name: str) -> list[Job]:
+    """The jobs without a row in data/results/NAME.csv that was made by the very same command."""
+    from .recorded import load
+
+    try:
+        rows = load(name)[0]
+    except PdkitError:  # nothing is recorded yet
+        return list(jobs)
+    done = set(zip(rows.task, rows.recipe, rows.seed, rows.command, strict=True))
+    return [job for job in jobs if (*(job.labels[key] for key in ("task", "recipe", "seed")), job.command) not in done]
+
+
 @contextlib.contextmanager
 def _alone(name: str) -> Iterator[None]:
     """Refuse a second sweep of this name: both would work in the same folders."""
@@ -266,6 +278,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--ray", action="store_true", help="use Ray on this machine")
     parser.add_argument("--address", metavar="CLUSTER", help="use the Ray cluster at this address")
     parser.add_argument("--record", metavar="NAME", help="add the finished rows to data/results/NAME.csv (default: the spec's `record`)")
+    parser.add_argument("--missing", action="store_true", help="leave out what data/results has already, from whichever machine")
     parser.add_argument("--dry-run", action="store_true", help="list the jobs and run nothing")
     args = parser.parse_args(argv)
     if args.workers is not None and args.workers < 1:
@@ -276,22 +289,25 @@ def main(argv: list[str]) -> int:
         must_be_installed()
     spec = load_spec(args.spec)
     jobs, name = make_jobs(spec), args.record or spec.record
+    if args.missing:
+        jobs = missing(jobs, name)
     if args.dry_run:
         print(*map(_listing, jobs), sep="\n")
         return 0
     path = spec.path.resolve()
     command = f"pdkit sweep {path.relative_to(ROOT) if path.is_relative_to(ROOT) else path.name}"
     command += f" --record {args.record}" if args.record else ""
+    problems: dict[str, str] | None = None
     with _alone(spec.name):
         backend = Ray(args.address, args.workers) if args.ray or args.address else Local()
-        try:
+        with contextlib.suppress(KeyboardInterrupt):
             problems = sweep(jobs, backend, getattr(backend, "limit", args.workers or 2))
-        except KeyboardInterrupt:
-            print(f"\nInterrupted; {sum(job.result.exists() for job in jobs)} of {len(jobs)} jobs are finished and kept. "
-                  f"`{shlex.join(['pdkit', 'sweep', *argv])}` goes on.")
-            return 130
         if name:
             print(f"{record_results(name, jobs, command)} rows recorded in data/results/{name}.csv")
+    if problems is None:
+        print(f"\nInterrupted; {sum(job.result.exists() for job in jobs)} of {len(jobs)} jobs are finished and kept. "
+              f"`{shlex.join(['pdkit', 'sweep', *argv])}` goes on.")
+        return 130
     for job in jobs:
         if job.name in problems:
             print(f"FAILED {job.name}: {problems[job.name].rstrip('.')} (log: {job.folder / LOG})")

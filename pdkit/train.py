@@ -3,6 +3,8 @@ from __future__ import annotations
 
 import ast
 import dataclasses
+import hashlib
+import json
 import math
 import os
 import sys
@@ -13,6 +15,7 @@ from typing import Any
 import pandas as pd
 
 from .cli import Parser
+from .decorated import Decorated
 from .demos import Demos, load_demos, sources
 from .errors import PdkitError, unknown
 from .evaluate import evaluate
@@ -22,6 +25,7 @@ from .methods import METHODS
 from .methods.registry import base_folder as shipped_base
 from .methods.registry import make_trainer, method_config, trainer_of
 from .online import Trainer
+from .online_config import OnlineConfig
 from .policies import POLICIES, Policy, load_policy, save_policy
 from .policies.base import read_card
 from .profiles import PROFILES, checked, differences, flat
@@ -29,6 +33,7 @@ from .recorded import record
 from .runs import Run, describe_machine, origin
 from .seeds import reported_seeds
 from .tasks import get_task
+from .tasks.spec import TaskSpec
 from .tensorboard import Board
 from .torch_setup import set_threads
 
@@ -112,7 +117,6 @@ def _decorated(args) -> int:
     get_task(args.task)
     base_folder = Path(args.base) if args.base else shipped_base(args.method, args.task)
     args.recipe = args.recipe or ("lesson" if args.method == "policy_decorator" else args.method)
-    base_table = None
     if args.episodes < 1 or min(args.seeds) < 0:
         raise PdkitError("--episodes must be at least 1 and every seed 0 or more.")
     for seed in args.seeds:
@@ -124,7 +128,7 @@ def _decorated(args) -> int:
         out = Path(args.out or runs_root() / "train") / f"{args.task}-{args.recipe}-seed{seed}"
         demos = base_demos(args) if config.demo_fraction or trainer_of(args.method).needs_demos else None
         started_from = origin(read_card(base_folder), demos)
-        row, base_table = decorate(config, base, demos, out, args.episodes, started_from, base_table, args.tensorboard)
+        row = decorate(config, base, demos, out, args.episodes, started_from, args.tensorboard)
         row |= {"recipe": args.recipe, "command": command_of(args, seed)}
         print(", ".join(f"{k} {v}" for k, v in row.items()), flush=True)
         if args.record:
@@ -150,11 +154,10 @@ def command_of(args, seed: int) -> str:
 
 
 def decorate(config, base: Policy, demos: Demos | None, out: Path, episodes: int, started_from: dict[str, Any],
-             base_table: pd.DataFrame | None = None, tensorboard: bool = False) -> tuple[dict[str, Any], pd.DataFrame]:
-    """Train (or resume) one seed in `out` and evaluate base and decorated on the same test seeds.
+             tensorboard: bool = False) -> dict[str, Any]:
+    """Train (or resume) one seed in `out`, evaluate base and decorated on the same test seeds, and return one row of evidence.
 
     `started_from` (see `origin`) tells which base policy and demonstrations these are; a run is resumed only with the same ones.
-    Returns one row of evidence, and the base policy's episodes: the next seed's too, so they can be passed on as `base_table`.
     """
     run = Run(out, "decorated", flat(config) | started_from)
     trainer = make_trainer(config, base, demos)
@@ -174,13 +177,11 @@ def decorate(config, base: Policy, demos: Demos | None, out: Path, episodes: int
         board.close()
     run.write_metrics(trainer.rows)
     trainer.save_policy(policy, out / "decorated")
-    tables = {} if base_table is None else {"base": base_table}
-    for name, actor in (("base", base), ("decorated", policy)):
-        if name not in tables:
-            actor.reset(0)
-            tables[name] = evaluate(trainer.spec, actor.act, reported_seeds(episodes), window=actor.window, num_envs=50)
+    tables = {"base": _base_episodes(base, trainer.spec, episodes, config, started_from["base"]),
+              "decorated": _episodes(policy, trainer.spec, episodes)}
+    for name, table in tables.items():
         with atomic_file(out / f"{name}_episodes.csv") as temporary:
-            tables[name].to_csv(temporary, index=False)
+            table.to_csv(temporary, index=False)
     row = dict(task=config.task, method=config.method, policy=base.kind, seed=config.seed,
                train_minutes=round(trainer.train_seconds / 60, 2), cores=describe_machine()["cores"], env_steps=trainer.step,
                first_reward_step=trainer.first_reward or None,
@@ -188,7 +189,23 @@ def decorate(config, base: Policy, demos: Demos | None, out: Path, episodes: int
                **_outcome("base", tables["base"]), **_outcome("decorated", tables["decorated"]),
                load_average=round(os.getloadavg()[0], 1) if hasattr(os, "getloadavg") else None)
     run.finish(**row)
-    return row, tables["base"]
+    return row
+
+
+def _episodes(actor: Policy | Decorated, spec: TaskSpec, episodes: int) -> pd.DataFrame:
+    actor.reset(0)
+    return evaluate(spec, actor.act, reported_seeds(episodes), window=actor.window, num_envs=50)
+
+
+def _base_episodes(base: Policy, spec: TaskSpec, episodes: int, config: OnlineConfig, weights: str) -> pd.DataFrame:
+    """The base policy's test episodes: the same for every method and seed that starts from it, so they are run once and kept."""
+    what = json.dumps([spec.name, config.start_fraction, episodes, weights, describe_machine()["versions"]])
+    kept = runs_root() / "base_episodes" / f"{spec.name}-{hashlib.sha256(what.encode()).hexdigest()[:16]}.csv"
+    if not kept.exists():
+        table = _episodes(base, spec, episodes)
+        with atomic_file(kept) as temporary:
+            table.to_csv(temporary, index=False)
+    return pd.read_csv(kept)
 
 
 def _outcome(name: str, table: pd.DataFrame) -> dict[str, float | None]:

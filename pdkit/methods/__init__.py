@@ -25,8 +25,9 @@ class Method:
 # No base action is added and nothing is gated; acting is the actor's own business from the first step.
 _OWN_POLICY = dict(alpha=1.0, alpha_scale=(), H=0, residual_penalty=0.0)
 
-# A transformer as the actor: at batch 256 an update costs a core 0.4 s, twenty times a residual's, and a lesson would take an hour.
-_TRANSFORMER = dict(batch=64)
+# A transformer as the actor: at batch 256 an update costs a core 0.1 to 0.4 s, ten times a residual's or more, and a lesson would take
+# an hour. At batch 64 it costs 0.03 s, still four times as much; half as many fit into the time of a decorator's run.
+_TRANSFORMER = dict(batch=64, utd=0.125)
 
 # PPO learns from its own policy alone, with the learning rate falling from the start (as in cleanrl) and a spread that starts at 0.6
 # (cleanrl: 1; the lesson's 0.2 is enough for SAC, whose entropy term raises it)
@@ -76,14 +77,16 @@ METHODS: dict[str, Method] = {
         changes=_ON_POLICY | _OWN_POLICY, paper=_ON_POLICY_PAPER, base="bet-sac", trainer="pdkit.methods.ppo:PPOFineTune"),
     "rot": Method(
         "ROT", "Haldar et al. 2022; appendix B.5; facts.md 3.1: SAC fine-tuning, reward by optimal transport, Q-filtered imitation",
-        changes=_OWN_POLICY | dict(warmup="policy", demo_fraction=0.0, reward_shift=0.0), base="bet-sac", trainer="pdkit.methods.rot:ROT"),
+        changes=_OWN_POLICY | dict(warmup="policy", demo_fraction=0.0, reward_shift=0.0), lesson=_TRANSFORMER, base="bet-sac",
+        trainer="pdkit.methods.rot:ROT"),
     "fish": Method(
         "FISH", "Haldar et al. 2023; appendix B.5, G.2; facts.md 3.6: residual over VINN on a reward by optimal transport",
         changes=dict(alpha=0.2, alpha_scale=(), H=0, critic_input="concat", actor_input="obs+base", warmup="uniform", demo_fraction=0.0,
                      reward_shift=0.0, residual_penalty=0.0), base="vinn", trainer="pdkit.methods.fish:FISH"),
     "calql": Method(
         "Cal-QL", "Nakamoto et al. 2023; appendix B.5, F.3 (E); facts.md 3.3: imitated transformer, demonstrations, online SAC",
-        changes=_CALQL | dict(demo_fraction=0.0), paper=_CALQL_PAPER, base="bet-sac", trainer="pdkit.methods.calql:TransformerCalQL"),
+        changes=_CALQL | dict(demo_fraction=0.0), lesson=_TRANSFORMER, paper=_CALQL_PAPER, base="bet-sac",
+        trainer="pdkit.methods.calql:TransformerCalQL"),
     "calql_a": Method(
         "Cal-QL, the original", "appendix F.3 (A); facts.md 3.3: small MLP, demonstrations and rollouts, online Cal-QL",
         changes=_CALQL | dict(demo_fraction=0.5, calql_data="mixed", calql_online="calql"), paper=_CALQL_ORIGINAL,
@@ -96,7 +99,7 @@ METHODS: dict[str, Method] = {
         changes=_CALQL | dict(demo_fraction=0.0), paper=_CALQL_ORIGINAL, trainer="pdkit.methods.calql:SmallCalQL"),
     "calql_d": Method(
         "Cal-QL on a random GPT", "appendix F.3 (D): GPT from random weights, demonstrations, online SAC",
-        changes=_CALQL | dict(demo_fraction=0.0, calql_pretrained=False), paper=_CALQL_PAPER, base="bet-sac",
+        changes=_CALQL | dict(demo_fraction=0.0, calql_pretrained=False), lesson=_TRANSFORMER, paper=_CALQL_PAPER, base="bet-sac",
         trainer="pdkit.methods.calql:TransformerCalQL"),
     "jsrl": Method(
         "JSRL", "Uchendu et al. 2023; appendix B.5; facts.md 3.4: the base policy begins each episode, a learner from scratch ends it",

@@ -5,12 +5,15 @@ from dataclasses import dataclass
 
 from ..errors import PdkitError, unknown
 
+CRITIC_BACKBONES = ("mlp", "shared", "separate")
+
 
 @dataclass(frozen=True)
 class MethodConfig:
     """Only the method named in a comment reads its fields."""
 
     lora: int = 8  # fine-tuning: rank of the adapters (the paper gives none); 0 trains all weights
+    critic_backbone: str = "mlp"  # fine-tuning: what critics see the window through (pdkit/rl/gpt_critic.py; appendix F.5.1)
     # PPO (the paper gives no numbers; cleanrl's defaults for continuous control, see ppo.py)
     ppo_rollout: int = 256  # ppo: decisions of each environment between updates (cleanrl: 2,048 of one; here of 8 together)
     ppo_epochs: int = 10  # ppo: passes over a rollout
@@ -54,7 +57,7 @@ class MethodConfig:
         if min(self.ot_iterations, self.ot_demos, self.ot_trunk, self.ot_renew_every) < 1 or self.ot_total <= 0 or self.bc_weight < 0:
             raise PdkitError("Optimal transport needs ot_iterations, ot_demos, ot_trunk and ot_renew_every of 1 or more, ot_total above 0 "
                              "and bc_weight of 0 or more.")
-        for name, known in (("calql_data", ("demos", "mixed")), ("calql_online", ("sac", "calql"))):
+        for name, known in (("critic_backbone", CRITIC_BACKBONES), ("calql_data", ("demos", "mixed")), ("calql_online", ("sac", "calql"))):
             if getattr(self, name) not in known:
                 raise unknown(name, getattr(self, name), known)
         if min(self.calql_actions, self.calql_rollouts) < 1 or min(self.calql_offline_updates, self.calql_weight) < 0 \

@@ -3,7 +3,8 @@
     a = a_pi(o),  pi the whole Behavior Transformer, by SAC's actor loss through its adapters
 
 No base action is added and nothing is gated: alpha = 1, H = 0 over a policy that does nothing. Critics are small MLPs that see the
-last observation; the actor sees the whole window, so whole windows are stored.
+last observation; the actor sees the whole window, so whole windows are stored. With another `critic_backbone` critics, too, see the
+window, through a transformer (pdkit/rl/gpt_critic.py; appendix F.5.1).
 """
 from __future__ import annotations
 
@@ -16,6 +17,7 @@ from ..online import Trainer
 from ..policies import Policy, save_policy
 from ..policies.bet_sac import BeTForSAC
 from ..policies.zero import Zero
+from ..rl.gpt_critic import GPTSAC, GPTCritics, make_backbone
 from ..rl.sac import SAC
 
 
@@ -38,9 +40,14 @@ class FineTune(Trainer):
         return self.spec.obs_dim * self._start_policy.window
 
     def _make_agent(self) -> SAC:
-        c, dim, normalizer = self.config, self.spec.obs_dim, self.base.normalizer
-        return SAC(dim, self.spec.act_dim, c.sac, c.decorator, device=c.device, actor=self._start_policy.with_lora(c.method_config.lora),
-                   critic_view=lambda stored: normalizer(stored[:, -dim:]))
+        c, m, start, dim, normalizer = self.config, self.config.method_config, self._start_policy, self.spec.obs_dim, self.base.normalizer
+        actor = start.with_lora(m.lora)
+        if m.critic_backbone == "mlp":
+            return SAC(dim, self.spec.act_dim, c.sac, c.decorator, device=c.device, actor=actor,
+                       critic_view=lambda stored: normalizer(stored[:, -dim:]))
+        backbone = make_backbone(m.critic_backbone, actor, start, m.lora, c.sac.critic_warmup)
+        critics = GPTCritics(backbone, c.decorator.critic_dim(0, self.spec.act_dim), c.sac, c.sac.num_critics)
+        return GPTSAC(self.stored_dim, self.spec.act_dim, c.sac, c.decorator, device=c.device, actor=actor, critics=critics)
 
     def _as_policy(self, actor: BeTForSAC, base: Policy) -> BeTForSAC:
         return actor

@@ -25,6 +25,7 @@ from ..decorator import gate
 from ..errors import PdkitError
 from ..online import Trainer
 from ..online_config import lr_factor, stops
+from ..rl.gpt_critic import GPTCritics, make_backbone
 from ..rl.ppo import PPO, ROLLOUT_COLUMNS
 from ..rl.replay import Replay
 from .finetune import FineTune
@@ -81,12 +82,17 @@ class OnPolicy(Trainer):
 
 
 class PPOFineTune(OnPolicy, FineTune):
-    """PPO on a `bet-sac` policy with adapters; the value function is an MLP on the last observation (appendix F.5.1)."""
+    """PPO on a `bet-sac` policy with adapters; the value function is an MLP on the last observation, or a head on a transformer
+    (`critic_backbone`, appendix F.5.1)."""
 
     def _make_agent(self) -> PPO:
-        c, dim, start, normalizer = self.config, self.spec.obs_dim, self._start_policy, self.base.normalizer
+        c, m, dim, start, normalizer = self.config, self.config.method_config, self.spec.obs_dim, self._start_policy, self.base.normalizer
         if start.config["act_dropout"]:
             raise PdkitError("PPO compares probabilities of one decision before and after learning, which dropout would change: "
                              "take a base policy with act_dropout=False.")
-        return PPO(dim, self.spec.act_dim, c.method_config, c.sac, c.decorator, device=c.device,
-                   actor=start.with_lora(c.method_config.lora), value_view=lambda stored: normalizer(stored[:, -dim:]))
+        actor = start.with_lora(m.lora)
+        if m.critic_backbone == "mlp":
+            return PPO(dim, self.spec.act_dim, m, c.sac, c.decorator, device=c.device, actor=actor,
+                       value_view=lambda stored: normalizer(stored[:, -dim:]))
+        value = GPTCritics(make_backbone(m.critic_backbone, actor, start, m.lora), 0, c.sac, 1)
+        return PPO(self.stored_dim, self.spec.act_dim, m, c.sac, c.decorator, device=c.device, actor=actor, value=value)

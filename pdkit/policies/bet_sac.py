@@ -93,7 +93,7 @@ class BeTForSAC(BeT):
 
     def gaussian(self, windows: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Mean and log_std (B, act_dim) before the tanh, at the last position, float32."""
-        features = self.gpt(self.normalizer(windows))[:, -1]
+        features = self.gpt(self.normalizer(windows), last=True)[:, 0]
         choice = self.head(features).argmax(dim=-1)
         offsets = self.regression(features).unflatten(-1, (self.config["bins"], -1))[torch.arange(len(choice)), choice]
         low, high = LOG_STD

@@ -76,17 +76,20 @@ class PPO:
         sizes: its hidden, layers, actor_layer_norm, critic_layer_norm and log_std_range.
         normalize: maps stored observations before any network sees them (identity by default).
         actor: another actor than the small Gaussian one: a module with `heads`, `squash` and `mean_action` as `Actor` has them.
+        value: another value function than the plain one: a `Critics` of one member; it may share modules with the actor.
         value_view: what the value function sees of a normalised observation, (B, stored) -> (B, obs_dim); all of it by default.
     """
 
     def __init__(self, obs_dim: int, act_dim: int, config: MethodConfig, sizes: SACConfig, decorator: DecoratorConfig, *,
-                 normalize=None, actor: nn.Module | None = None, value_view=None, device: str = "cpu"):
+                 normalize=None, actor: nn.Module | None = None, value: Critics | None = None, value_view=None,
+                 device: str = "cpu"):
         self.config, self.decorator, self.device = config, decorator, device
         self.normalize, self.value_view = normalize or (lambda x: x), value_view or (lambda x: x)
         dim, s = decorator.actor_dim(obs_dim, act_dim), sizes
         self.actor = (actor or Actor(dim, act_dim, s.hidden, s.layers, s.actor_layer_norm, s.log_std_range)).to(device)
-        self.value = Critics(dim, s.hidden, s.layers, 1, s.critic_layer_norm).to(device)
-        self.parameters = [p for p in [*self.actor.parameters(), *self.value.parameters()] if p.requires_grad]
+        self.value = (value or Critics(dim, s.hidden, s.layers, 1, s.critic_layer_norm)).to(device)
+        both = dict.fromkeys([*self.actor.parameters(), *self.value.parameters()])  # once each, where they share some
+        self.parameters = [p for p in both if p.requires_grad]
         self.optimizer = torch.optim.Adam(self.parameters, lr=config.ppo_lr, eps=1e-5, fused=True)
         self.updates = 0
 

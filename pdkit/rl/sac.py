@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import copy
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -95,7 +96,7 @@ class SAC:
         self.log_temperature = torch.full((), math.log(c.init_temperature), device=device, requires_grad=c.autotune)
         self.target_entropy = -c.target_entropy_scale * act_dim
         self.actor_optimizer = torch.optim.Adam([p for p in self.actor.parameters() if p.requires_grad], lr=c.actor_lr, fused=True)
-        self.critic_optimizer = torch.optim.Adam(self.critics.parameters(), lr=c.critic_lr, fused=True)
+        self.critic_optimizer = torch.optim.Adam([p for p in self.critics.parameters() if p.requires_grad], lr=c.critic_lr, fused=True)
         self.temperature_optimizer = torch.optim.Adam([self.log_temperature], lr=c.critic_lr, fused=True) if c.autotune else None
         self.updates = 0
 
@@ -143,8 +144,8 @@ class SAC:
             loss = loss + self._critic_penalty(batch, obs, values)
         self.critic_optimizer.zero_grad(set_to_none=True)
         loss.backward()
-        for member in self.critics.members:
-            torch.nn.utils.clip_grad_norm_(member.parameters(), self.config.grad_clip)
+        for part in self._clipped():
+            torch.nn.utils.clip_grad_norm_(part.parameters(), self.config.grad_clip)
         self.critic_optimizer.step()
         return {"critic_loss": loss.detach() / self.config.num_critics, "q_mean": values.detach().mean(), "target_mean": target.mean()}
 
@@ -153,7 +154,7 @@ class SAC:
         return 0.0
 
     def _update_actor(self, batch, obs, noise, temperature) -> dict[str, torch.Tensor]:
-        self.critics.requires_grad_(False)  # their weights' gradients would be thrown away
+        self._hold_critics(True)
         with autocast(self.device, self.config.bf16):
             residual, log_pi = self.actor.sample(actor_features(self.decorator, obs, batch["base"]), noise)
             values = self.critics(critic_features(self.decorator, self.critic_view(obs), batch["base"], residual))
@@ -165,7 +166,7 @@ class SAC:
             loss.backward()
             torch.nn.utils.clip_grad_norm_(self.actor.parameters(), self.config.grad_clip)
             self.actor_optimizer.step()
-        self.critics.requires_grad_(True)
+        self._hold_critics(False)
         with torch.no_grad():
             if self.config.average:
                 # A plain mean at first (decay 1 - 1/k), so that the near-zero start is forgotten quickly.
@@ -177,6 +178,14 @@ class SAC:
             (self.log_temperature * (entropy - self.target_entropy)).backward()
             self.temperature_optimizer.step()
         return {"actor_loss": loss.detach(), "entropy": entropy, "temperature": temperature, "residual_abs": residual.detach().abs().mean()}
+
+    def _hold_critics(self, hold: bool) -> None:
+        """Leave the critics out of the gradients while the actor moves: theirs would be thrown away."""
+        self.critics.requires_grad_(not hold)
+
+    def _clipped(self) -> Sequence[nn.Module]:
+        """Parts of the critics whose gradients are clipped each by its own norm."""
+        return self.critics.members
 
     def _actor_loss(self, loss: torch.Tensor, batch, obs: torch.Tensor, value: torch.Tensor) -> torch.Tensor:
         """What the actor descends, of SAC's own loss and the values (B,) of its actions: some methods add to it."""

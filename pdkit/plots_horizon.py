@@ -1,0 +1,126 @@
+"""Figures of notebook 10: a quantity against the horizon, which is the share of the way to success that is left."""
+from __future__ import annotations
+
+import matplotlib as mpl
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+
+from .horizon_analysis import interval_of
+from .plots import COLORS, Picture, _columns, _percent, blank, styled
+from .plots_compare import PALETTE
+from .stats import wilson
+
+HORIZON = "horizon: share of the way to success that is left"
+
+
+def _horizons(ax: Axes, fractions) -> None:
+    """The horizontal axis: 1 - start_fraction, longer to the right."""
+    marks = sorted(1 - f for f in set(fractions))
+    ax.set(xlabel=HORIZON, xlim=(0, 1.06))
+    ax.set_xticks(marks, [f"{m:.0%}" for m in marks])
+
+
+@styled
+def starts_figure(table: pd.DataFrame) -> Picture:
+    """How far along `horizon_analysis.starts` are: distance of palm and handle, door hinge; a dot a seed, a line for the mean."""
+    _columns(table, "start_fraction", "hinge", "reach")
+    figure, axes = blank(1, 2, (8.6, 3.2))
+    for ax, column, label in zip(axes[0], ("reach", "hinge"), ("palm to handle (m)", "door hinge (rad)"), strict=True):
+        ax.plot(1 - table.start_fraction, table[column], "o", ms=4, color=COLORS["exploring"], mew=0)
+        mean = table.groupby("start_fraction")[column].mean()
+        ax.plot(1 - mean.index, mean, "-", color=COLORS["decorated"])
+        _horizons(ax, table.start_fraction)
+        ax.set_ylabel(label)
+    axes[0, 1].axhline(1.35, color=COLORS["gained"], ls="--", lw=1.2)
+    axes[0, 1].annotate("solved", (0.03, 1.35), (0, -11), textcoords="offset points", color=COLORS["gained"], fontsize=8.5)
+    return figure
+
+
+@styled
+def exploration_figure(table: pd.DataFrame, title: str = "") -> Picture:
+    """Left: share of episodes with a reward, 95 % Wilson intervals. Right: steps per reward; a triangle at the steps tried where none came.
+
+    `table` has who, start_fraction, episodes, solved, steps and steps_per_reward (see `horizon_analysis.exploration`).
+    """
+    _columns(table, "who", "start_fraction", "episodes", "solved", "steps", "steps_per_reward")
+    figure, axes = blank(1, 2, (9.4, 3.7))
+    left, right = axes[0]
+    for i, (who, rows) in enumerate(table.groupby("who", sort=False)):
+        rows, color = rows.sort_values("start_fraction"), PALETTE[i]
+        rates = [wilson(int(r.solved), int(r.episodes)) for r in rows.itertuples()]
+        x = 1 - rows.start_fraction.to_numpy() + 0.008 * (i - 1)  # side by side where they coincide
+        bars = [[r.value - r.low for r in rates], [r.high - r.value for r in rates]]
+        left.errorbar(x, [r.value for r in rates], bars, fmt="-o", ms=4, lw=1.4, capsize=2, color=color, label=who)
+        met = rows.solved.to_numpy() > 0
+        right.plot(x[met], rows.steps_per_reward[met], "-o", ms=4, color=color)
+        right.plot(x[~met], rows.steps[~met], "^", ms=8, mfc="white", color=color)
+    right.plot([], [], "^", ms=8, mfc="white", color="0.3", label="none within so many steps")
+    right.set(yscale="log", ylabel="environment steps per reward")
+    _percent(left, "episodes with a reward")
+    for ax in (left, right):
+        _horizons(ax, table.start_fraction)
+    figure.legend(loc="outside lower center", ncols=4, fontsize=8.5)
+    figure.suptitle(title, x=0.01, ha="left", fontsize=11, weight="bold")
+    return figure
+
+
+@styled
+def propagation_figure(table: pd.DataFrame, title: str = "") -> Picture:
+    """Updates until a corridor is valued right against its length, from rows length, n_step, updates; a line for each n-step return."""
+    _columns(table, "length", "n_step", "updates")
+    figure, axes = blank(size=(6.4, 3.7))
+    ax = axes[0, 0]
+    for i, (n_step, rows) in enumerate(table.dropna(subset=["updates"]).groupby("n_step")):
+        mean = rows.groupby("length").updates.mean()
+        ax.plot(mean.index, mean, "-", color=PALETTE[i], label=f"{n_step}-step returns")
+        ax.plot(rows.length, rows.updates.astype(float), "o", ms=4, mew=0, alpha=0.7, color=PALETTE[i])
+    ax.set(xlabel="length of the corridor (steps)", ylabel="gradient steps", xlim=(0, None), ylim=(0, None))
+    ax.set_xticks(sorted(set(table.length)))
+    ax.yaxis.set_major_formatter(mpl.ticker.FuncFormatter(lambda y, _: f"{y:,.0f}"))
+    ax.legend(fontsize=8.5)
+    ax.set_title(title)
+    return figure
+
+
+@styled
+def sweep_figure(table: pd.DataFrame, column: str, labels: dict[str, str], *, own: pd.DataFrame | None = None, budget: int = 0,
+                 title: str = "", ylabel: str = "") -> Picture:
+    """`column` of `by_fraction` rows against the horizon: a dot a seed, the mean and its bootstrap interval, a line a method of `labels`.
+
+    Args:
+        own: the reader's rates of base policies (who, start_fraction, success), as dashed lines; only where `column` is a success.
+        budget: for steps: a run without a value is drawn there as an open triangle, left out of the mean; the axis is logarithmic.
+    """
+    _columns(table, "method", "start_fraction", column)
+    figure, axes = blank(size=(7.6, 4.2))
+    ax = axes[0, 0]
+    present = {method: name for method, name in labels.items() if method in set(table.method)}
+    for i, (method, name) in enumerate(present.items()):
+        rows, color, shift = table[table.method == method], PALETTE[i], 0.012 * (i - 1)
+        known = rows.dropna(subset=[column])
+        ax.plot(1 - known.start_fraction + shift, known[column], "o", ms=3.5, mew=0, alpha=0.45, color=color)
+        for fraction, lost in rows[rows[column].isna()].groupby("start_fraction"):  # side by side, or else they would hide each other
+            ax.plot(1 - fraction + shift + 0.004 * np.arange(len(lost)), [budget] * len(lost), "^", ms=7, mfc="white", color=color)
+        groups = [(f, part[column]) for f, part in known.groupby("start_fraction")]
+        for fraction, values in groups:
+            interval = interval_of(values)
+            ax.plot([1 - fraction + shift] * 2, [interval.low, interval.high], color=color, lw=2.2)
+        ax.plot([1 - f + shift for f, _ in groups], [v.mean() for _, v in groups], "-o", ms=6, color=color, label=name)
+    if own is not None:
+        for who, rows in own.groupby("who", sort=False):
+            ax.plot(1 - rows.start_fraction, rows.success, "--", marker="o", ms=6, mfc="white", lw=1.2, color=COLORS["base"],
+                    alpha=1.0 if who == own.who.iloc[0] else 0.5, label=f"{who}, your run")
+    _horizons(ax, table.start_fraction)
+    if budget:
+        ax.plot([], [], "^", ms=7, mfc="white", color="0.3", label="no reward in the whole run")
+        ax.set(yscale="log", ylabel=ylabel or column.replace("_", " "))
+    elif column == "gain":
+        ax.axhline(0, color=COLORS["base"], lw=1.2, ls="--")
+        ax.yaxis.set_major_formatter(mpl.ticker.PercentFormatter(1.0, decimals=0))
+        ax.set_ylabel(ylabel or "success gained over the base policy")
+    else:
+        _percent(ax, ylabel or "success")
+    ax.set_title(title)
+    figure.legend(loc="outside lower center", ncols=3, fontsize=8.5)
+    return figure
