@@ -36,6 +36,19 @@ def test_attention_is_causal():
     assert not torch.allclose(one[0, 3], other[0, 3])
 
 
+def test_the_last_position_alone_is_the_same():
+    """Features and their gradients, for learners that read nothing else."""
+    policy, x = bet(dropout=0.0, layers=2).eval(), torch.randn(5, 4, 3)
+    grads = []
+    for last in (False, True):
+        features = policy.gpt(x, last=last)
+        assert features.shape[1] == (1 if last else 4)
+        policy.zero_grad()
+        features[:, -1].square().sum().backward()
+        grads.append([features[:, -1].detach(), *(p.grad.clone() for p in policy.gpt.parameters())])
+    assert all(torch.allclose(a, b, atol=1e-5) for a, b in zip(*grads, strict=True))
+
+
 def test_bins_are_the_k_means_centres():
     policy = bet()
     centres = np.array([[0.8, 0.8], [-0.8, 0.8], [0.0, -0.8]], np.float32)

@@ -14,6 +14,7 @@ from pdkit.errors import PdkitError
 from pdkit.files import DATA
 from pdkit.policies import load_policy
 from pdkit.probes import ProbeBase
+from pdkit.seeds import reported_seeds
 from pdkit.tensorboard import Board
 from pdkit.train import parse_settings
 
@@ -114,6 +115,13 @@ def test_training_from_the_command_line_records_a_row_a_seed(monkeypatch, tmp_pa
     table = pd.read_csv(tmp_path / "results" / "t.csv")
     assert len(table) == 1 and table.env_steps[0] >= 600 and table.command[0].startswith("pdkit train decorated Door --profile smoke")
     assert (tmp_path / "results" / "t.png").stat().st_size > 1000
+    kept, = (tmp_path / "runs" / "base_episodes").iterdir()  # the base policy's episodes, run once for all that start from it
+    episodes = pd.read_csv(kept)
+    assert list(episodes.seed) == reported_seeds(2) and episodes.success_once.mean() == table.base_success[0]
+    episodes.assign(success_once=0.25).to_csv(kept, index=False)
+    assert call(monkeypatch, *words) == 0 and pd.read_csv(tmp_path / "results" / "t.csv").base_success[0] == 0.25
+    assert call(monkeypatch, *words, "--episodes", "3") == 0  # of other episodes there are others
+    assert pd.read_csv(tmp_path / "results" / "t.csv").base_success[0] != 0.25
     policy = load_decorated(tmp_path / "runs" / "train" / "Door-lesson-seed0" / "decorated")
     base = load_policy(DATA / "checkpoints" / "Door" / "base")
     assert policy.base.state_dict().keys() == base.state_dict().keys()
