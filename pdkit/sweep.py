@@ -278,6 +278,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--ray", action="store_true", help="use Ray on this machine")
     parser.add_argument("--address", metavar="CLUSTER", help="use the Ray cluster at this address")
     parser.add_argument("--record", metavar="NAME", help="add the finished rows to data/results/NAME.csv (default: the spec's `record`)")
+    parser.add_argument("--seeds", type=int, nargs="+", metavar="SEED", help="only these of the spec's seeds")
     parser.add_argument("--missing", action="store_true", help="leave out what data/results has already, from whichever machine")
     parser.add_argument("--dry-run", action="store_true", help="list the jobs and run nothing")
     args = parser.parse_args(argv)
@@ -289,6 +290,10 @@ def main(argv: list[str]) -> int:
         must_be_installed()
     spec = load_spec(args.spec)
     jobs, name = make_jobs(spec), args.record or spec.record
+    if args.seeds:
+        jobs = [job for job in jobs if job.labels["seed"] in args.seeds]
+        if not jobs:
+            raise PdkitError(f"{spec.path.name} has none of the seeds {' '.join(map(str, args.seeds))}.")
     if args.missing:
         jobs = missing(jobs, name)
     if args.dry_run:
