@@ -5,11 +5,12 @@ its end, unless `strict` is set (for grading): then what is wrong is a PdkitErro
 """
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 
 import numpy as np
 import torch
 
+from . import stats
 from .errors import PdkitError
 from .policies import bet
 
@@ -140,6 +141,61 @@ def temperature_step(answer: Callable, strict: bool = False) -> bool:
     return _judge("temperature_step", complaints, strict)
 
 
+def actors_value(answer: Callable, strict: bool = False) -> bool:
+    """08: Q(f(w), a) (B,) whose gradient reaches the action and not what makes the features."""
+    def complaints() -> Iterator[str]:
+        generator = torch.Generator().manual_seed(0)
+        weight = torch.randn((4, 3), generator=generator).requires_grad_(True)
+        head = torch.randn((5, 1), generator=generator)
+        windows, action = torch.randn((6, 4), generator=generator), torch.randn((6, 2), generator=generator).requires_grad_(True)
+        expected = (torch.cat([windows @ weight, action], dim=1).tanh() @ head)[:, 0]
+        got = answer(lambda w: w @ weight, lambda x: x.tanh() @ head, windows, action)
+        if tuple(got.shape) != (6,):
+            yield f"it gives a tensor of shape {tuple(got.shape)}, not (6,)."
+        if not torch.allclose(got, expected, atol=1e-5):
+            yield "the values differ from those of the head on features and action: only the backward pass may differ."
+        if not got.requires_grad:
+            yield "no gradient reaches anything: cut off the features, not the whole value."
+        mine = torch.autograd.grad(got.sum(), [action, weight], allow_unused=True)
+        if mine[0] is None:
+            yield "no gradient reaches the action: the actor could not learn."
+        if mine[1] is not None and bool((mine[1] != 0).any()):
+            yield "the gradient reaches what makes the features: the actor could change what the critic sees."
+        if not torch.allclose(mine[0], torch.autograd.grad(expected.sum(), action)[0], atol=1e-5):
+            yield "the gradient on the action is not that of the head."
+
+    return _judge("actors_value", complaints, strict)
+
+
+def conservative(answer: Callable, strict: bool = False) -> bool:
+    """09: Cal-QL's conservative term: mean over states of log sum exp of valued actions, less the data's value."""
+    def complaints() -> Iterator[str]:
+        rng, d = np.random.default_rng(0), 3
+        data, returns = rng.normal(-5, 1, 6), np.array([-9.0, -1.0, -8.0, -2.0, -5.0, -9.0])
+        random, policy, log_pi = rng.normal(-5, 1, (4, 6)), rng.normal(-5, 1, (4, 6)), rng.normal(1, 1, (4, 6))
+
+        def term(lifted: bool = True, both: bool = False, volume: int = 1, sign: int = 1, total: bool = False) -> float:
+            parts = [(np.maximum(random, returns) if both else random) + volume * d * np.log(2),
+                     (np.maximum(policy, returns) if lifted else policy) - sign * log_pi]
+            each = np.log(np.exp(np.concatenate(parts)).sum(axis=0)) - data
+            return float(each.sum() if total else each.mean())
+
+        mistakes = {
+            term(lifted=False): "that is CQL: where is the max with the returns?",
+            term(both=True): "random actions are not lifted to the returns, the policy's alone.",
+            term(volume=0): "random actions have a density too: 0.5 in each of d dimensions.",
+            term(volume=-1): "a value is divided by its density: subtract the logarithm of 0.5^d, which is negative.",
+            term(sign=-1): "a value is divided by its density: subtract log pi.",
+            term(total=True): "take the mean over states, not the sum."}
+        got = float(answer(data, random, policy, log_pi, returns, d))
+        if abs(got - term()) > 1e-6:
+            yield next((said for value, said in mistakes.items() if abs(got - value) < 1e-6), f"it gives {got:.4f}, not {term():.4f}.")
+        if not np.isfinite(answer(data - 900, random - 900, policy - 900, log_pi, returns - 900, d)):
+            yield "it is not finite for values near -900: take the largest out before the exponential (np.logaddexp.reduce does)."
+
+    return _judge("conservative", complaints, strict)
+
+
 def corridor_values(answer: Callable, strict: bool = False) -> bool:
     """10: exact values of a corridor's cells when only the step out of the last one is rewarded, with 1."""
     def complaints() -> Iterator[str]:
@@ -156,3 +212,69 @@ def corridor_values(answer: Callable, strict: bool = False) -> bool:
                 yield f"with gamma {gamma:g} the first of {length} cells is worth {expected[0]:.4f}, not {got[0]:.4f}."
 
     return _judge("corridor_values", complaints, strict)
+
+
+def lookup(answer: Callable, strict: bool = False) -> bool:
+    """11: VINN's action (act_dim,) from all distances (N,), actions (N, act_dim) and k: softmax of minus the k smallest distances."""
+    def complaints() -> Iterator[str]:
+        distances, actions = np.array([0.5, 2.0, 0.1, 1.0]), np.array([[0.2, 1.0], [-1.0, 0.0], [0.6, -0.4], [0.0, 0.8]])
+
+        def weighted(rows, sign=-1.0):
+            weights = np.exp(sign * distances[rows])
+            return weights @ actions[rows] / weights.sum()
+
+        for k, rows in ((1, [2]), (3, [2, 0, 3]), (4, [2, 0, 3, 1])):
+            got, expected = np.asarray(answer(distances.copy(), actions.copy(), k), float), weighted(rows)
+            if got.shape != (2,):
+                yield f"with k={k} it gives an array of shape {got.shape}, not (2,): one action."
+            elif np.allclose(got, expected):
+                continue
+            elif np.allclose(got, weighted(rows, 1.0)):
+                yield "the farther a neighbour, the more it counts: softmax is taken of MINUS the distances."
+            elif np.allclose(got, weighted([0, 1, 2, 3])):
+                yield f"with k={k} all demonstrated steps are averaged; only the k nearest may count."
+            elif np.allclose(got, actions[rows].mean(axis=0)):
+                yield "all k neighbours count the same; weight them by the softmax of minus their distances."
+            elif np.allclose(got, np.exp(-distances[rows]) @ actions[rows]):
+                yield "the weights do not sum to 1: divide by their sum, or the action shrinks."
+            else:
+                yield f"with k={k} the first number is {got[0]:.3f}, not {expected[0]:.3f}."
+
+    return _judge("lookup", complaints, strict)
+
+
+def ranking(answer: Callable, recorded: Mapping[str, float], strict: bool = False) -> bool:
+    """13: the recipes of `recorded` (recipe -> mean success) in the order predicted, best first; pairs closer than 10 points are ties."""
+    def complaints() -> Iterator[str]:
+        got = list(answer())
+        if sorted(got) != sorted(recorded):
+            yield f"it must name each of {', '.join(recorded)} once, and gives {got}."
+        if any(np.isnan(value) for value in recorded.values()):
+            yield "nothing is recorded to hold it against: keep your prediction, and run the sweep that is named above."
+        wrong = [(recorded[b] - recorded[a], a, b) for i, a in enumerate(got) for b in got[i + 1:] if recorded[b] - recorded[a] > 0.1]
+        if wrong:
+            gap, first, second = max(wrong)
+            yield (f"{len(wrong)} of {len(got) * (len(got) - 1) // 2} pairs came out the other way round, most clearly {first} before "
+                   f"{second}, by {100 * gap:.0f} points. Which of your reasons was wrong?")
+
+    return _judge("ranking", complaints, strict)
+
+
+def interquartile_mean(answer: Callable, strict: bool = False) -> bool:
+    """16: the mean of the middle half of all numbers of a (runs x tasks) array."""
+    def complaints() -> Iterator[str]:
+        rng = np.random.default_rng(0)
+        for shape in ((8, 1), (5, 1), (4, 3)):
+            scores = rng.random(shape) ** 3
+            got, expected = float(answer(scores.copy())), stats.iqm(scores)
+            if abs(got - expected) < 1e-9:
+                continue
+            for other, what in ((scores.mean(), "it is the mean: a single run at 0 % moves it."),
+                                (np.median(scores), "it is the median: that throws away all but one or two runs."),
+                                (np.sort(scores, axis=0)[len(scores) // 4: len(scores) - len(scores) // 4].mean(),
+                                 "it cuts each task by itself: sort all numbers together.")):
+                if abs(got - other) < 1e-9:
+                    yield what
+            yield f"for {shape[0]} runs on {shape[1]} tasks it gives {got:.4f}, not {expected:.4f}; floor(n / 4) are cut at either side."
+
+    return _judge("interquartile_mean", complaints, strict)

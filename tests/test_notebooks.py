@@ -7,7 +7,7 @@ import sys
 import nbformat
 import pytest
 
-from pdkit import check, main_job, nb, unlearning
+from pdkit import check, main_job, nb, stats, unlearning
 from pdkit.errors import PdkitError
 from pdkit.files import DATA, ROOT, read_json
 from pdkit.main_job import configured, expected_minutes
@@ -91,12 +91,62 @@ def test_warm_start(tmp_path):
     assert (tmp_path / "updates.csv").exists() and result["exercise_solved"] is False
 
 
+def test_q_architectures(tmp_path):
+    result = run("08", tmp_path)
+    assert result["moved"] == "reproduced" and set(result["seconds"]) == {"mlp", "shared", "separate"}
+    alone, both = result["drift"]["Critics alone"], result["drift"]["Critics and actor"]
+    assert alone["mlp"] == alone["separate"] == 0 < alone["shared"] and min(both.values()) > 0
+    zero = {pull["critic"] for pull in result["pulls"] if pull["value"] == 0}
+    assert zero == {"MLP", "separate transformer"} and all(pull["policy"] > 0 for pull in result["pulls"])
+    assert result["own"]["recipe"] == "sac_finetune,critic_backbone=shared" and result["own"]["steps"] >= 600
+    assert (tmp_path / "drift.png").exists() and result["exercise_solved"] is False
+
+
+def test_q_architectures_with_ppo(tmp_path):
+    result = run("08", tmp_path, own_method="ppo_finetune", own_critic="separate", updates=2)
+    assert result["own"]["recipe"] == "ppo_finetune,critic_backbone=separate" and result["updates"] == 2
+
+
+def test_calql(tmp_path):
+    result = run("09", tmp_path)
+    assert [row["setup"] for row in result["setups"]] == list("ABCDE")
+    assert result["own"]["setup"] == "B" and result["own"]["steps"] >= 600 and result["updates"] == 4
+    assert set(result["values"]) == {"TD alone", "CQL", "Cal-QL"} and len(result["seconds"]) == 4
+    data = {row["source"]: row for row in result["data"]}
+    assert data["demonstrations"]["worst"] == 0 and data["rollouts"]["episodes"] == 4
+    assert (tmp_path / "calibration.png").exists() and result["exercise_solved"] is False
+
+
 def test_task_horizon(tmp_path):
     result = run("10", tmp_path)
     assert set(result["starts"]) == {"0", "0.9"} and result["starts"]["0.9"]["left"] < 10 < result["starts"]["0"]["left"]
     assert result["starts"]["0"]["hinge"] < result["starts"]["0.9"]["hinge"] < 1.35
     assert result["verdicts"]["propagation"] == "reproduced" and result["exercise_solved"] is False
     assert (tmp_path / "exploration.png").exists() and not (tmp_path / "starts.png").exists()
+
+
+def test_residual_rl_and_fish(tmp_path):
+    result = run("11", tmp_path, alpha=0.05, ks="[2]")
+    assert result["stray"]["decorator"] < result["stray"]["bound alone"] < result["stray"]["residual RL"]
+    assert set(result["first"]) == {"base policy", *result["stray"]} and result["early"] in ("reproduced", "partly", "not", "untested")
+    assert set(result["vinn"]) == {f"{features},{row}" for features in ("raw", "GPT") for row in ("k=2", "k=1,exclusion=3")}
+    assert 0 < result["late_ratio"]["policy_decorator"] < 0.05 < result["late_ratio"]["residual_rl"]
+    assert result["transport"]["all episodes"] > 0.5 and result["exercise_solved"] is False
+    assert (tmp_path / "vinn.png").exists() and not (tmp_path / "episodes.png").exists()
+
+
+def test_ablations(tmp_path):
+    result = run("13", tmp_path, alpha=0.3, critic_input="concat")
+    assert result["recipe"] == "alpha=0.3,H=0,critic_input=concat" and result["env_steps"] >= 600 and result["episodes"] == 2
+    assert result["scales"]["mean |a_t - a_(t-1)|"] == pytest.approx(0.111, abs=0.001) and len(result["claims"]) == 11
+    assert (tmp_path / "grid_curves.png").exists() and result["exercise_solved"] is False
+
+
+def test_leaderboard(tmp_path):
+    result = run("16", tmp_path, method="ppo_residual_rl", changes='{"ppo_epochs": 2}')
+    assert result["method"] == "ppo_residual_rl,ppo_epochs=2" and result["updates"] == 32  # 4 rollouts of 32 x 4, 2 x 4 updates each
+    assert len(result["order"]) == (0 if not result["recorded_runs"] else len(set(result["order"])))
+    assert (tmp_path / "curves.png").exists() and result["exercise_solved"] is False
 
 
 # ---- the main job ----------------------------------------------------------------------------------------------------
@@ -161,6 +211,7 @@ def test_announced_times_follow_the_budget():
 
 def test_exercises_accept_solutions_and_name_mistakes(capsys):
     import numpy as np
+    import torch
     import torch.nn.functional as F
 
     def focal(logits, target, gamma, power=True, mean=True):
@@ -173,9 +224,22 @@ def test_exercises_accept_solutions_and_name_mistakes(capsys):
         draw = rng.random((len(residual), residual.shape[1] if shape == 2 else 1))
         return residual * ((draw >= p) if opposite else (draw < p))
 
+    def actors_value(features_of, head, windows, action, cut=True):
+        features = features_of(windows)
+        return head(torch.cat([features.detach() if cut else features, action], 1))[:, 0]
+
+    def conservative(data, random, policy, log_pi, returns, d, lifted=True, both=False, volume=1, sign=1, stable=True):
+        parts = [(np.maximum(random, returns) if both else random) + volume * d * np.log(2),
+                 (np.maximum(policy, returns) if lifted else policy) - sign * log_pi]
+        every = np.concatenate(parts)
+        with np.errstate(divide="ignore"):
+            total = np.logaddexp.reduce(every, axis=0) if stable else np.log(np.exp(every).sum(axis=0))
+        return (total - data).mean()
+
     def unsolved(*_):
         raise NotImplementedError
 
+    finals = {"a": 0.9, "b": 0.2, "c": 0.85}
     cases = [
         (check.first_success, lambda s: int(np.argmax(s)) + 1 if s.any() else None, "solved"),
         (check.first_success, lambda s: int(np.argmax(s)) if s.any() else None, "counted from 1"),
@@ -198,10 +262,36 @@ def test_exercises_accept_solutions_and_name_mistakes(capsys):
         (check.temperature_step, lambda x, h, t, lr: x - lr * (h - t), "solved"),
         (check.temperature_step, lambda x, h, t, lr: x + lr * (h - t), "sign"),
         (check.temperature_step, lambda x, h, t, lr: x - lr * (h + t), "negative already"),
+        (check.actors_value, actors_value, "solved"),
+        (check.actors_value, lambda *x: actors_value(*x, cut=False), "reaches what makes the features"),
+        (check.actors_value, lambda f, h, w, a: actors_value(f, h, w, a).detach(), "no gradient reaches anything"),
+        (check.actors_value, lambda f, h, w, a: actors_value(f, h, w, a.detach(), cut=False), "could not learn"),
+        (check.actors_value, lambda f, h, w, a: h(torch.cat([f(w).detach(), a], 1)), "shape"),
+        (check.actors_value, lambda f, h, w, a: 2 * actors_value(f, h, w, a), "values differ"),
+        (check.actors_value, lambda f, h, w, a: actors_value(f, h, w, a.detach()) + 2 * (a - a.detach()).sum(1), "not that of the head"),
+        (check.conservative, conservative, "solved"),
+        (check.conservative, lambda *x: conservative(*x, lifted=False), "CQL"),
+        (check.conservative, lambda *x: conservative(*x, both=True), "policy's alone"),
+        (check.conservative, lambda *x: conservative(*x, volume=0), "density too"),
+        (check.conservative, lambda *x: conservative(*x, volume=-1), "which is negative"),
+        (check.conservative, lambda *x: conservative(*x, sign=-1), "subtract log pi"),
+        (check.conservative, lambda *x: 6 * conservative(*x), "not the sum"),
+        (check.conservative, lambda *x: conservative(*x, stable=False), "not finite"),
+        (check.conservative, lambda *x: conservative(*x) + 1, "it gives"),
         (check.corridor_values, lambda n, g: g ** np.arange(n - 1, -1, -1.0), "solved"),
         (check.corridor_values, lambda n, g: g ** np.arange(n), "wrong way round"),
         (check.corridor_values, lambda n, g: g ** np.arange(n, 0, -1.0), "no discount"),
         (check.corridor_values, lambda n, g: g ** (n - 1), "shape"),
+        (lambda a, strict=False: check.ranking(a, finals, strict), lambda: ["a", "c", "b"], "solved"),
+        (lambda a, strict=False: check.ranking(a, finals, strict), lambda: ["c", "a", "b"], "solved"),  # 5 points are a tie
+        (lambda a, strict=False: check.ranking(a, finals, strict), lambda: ["b", "a", "c"], "most clearly b before a, by 70 points"),
+        (lambda a, strict=False: check.ranking(a, finals, strict), lambda: ["a", "b"], "each of a, b, c once"),
+        (lambda a, strict=False: check.ranking(a, {"a": np.nan}, strict), lambda: ["a"], "nothing is recorded"),
+        (check.interquartile_mean, stats.iqm, "solved"),
+        (check.interquartile_mean, np.mean, "it is the mean"),
+        (check.interquartile_mean, np.median, "it is the median"),
+        (check.interquartile_mean, lambda s: np.mean([stats.iqm(task[:, None]) for task in s.T]), "each task by itself"),
+        (check.interquartile_mean, np.max, "floor"),
     ]
     for judge, answer, expected in cases:
         assert judge(answer) == (expected == "solved")

@@ -25,7 +25,7 @@ def train(name, base, decorator=None, sac=SMALL, **changes):
 
 
 def success(name, policy):
-    return evaluate(PROBES[name], policy.act, reported_seeds(100), num_envs=20).success_once.mean()
+    return evaluate(PROBES[name], policy.act, reported_seeds(100), window=policy.window, num_envs=20).success_once.mean()
 
 
 @pytest.mark.parametrize(("bootstrap", "expected"), [("truncated", -10.0), ("always", -10.0), ("never", -1 / (1 - 0.9 * 0.8))])

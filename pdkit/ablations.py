@@ -1,0 +1,110 @@
+"""One change at a time: the grid of bound and schedule, and differences from a reference recipe (notebook 13; appendix B.2, E, G.1).
+
+A table of runs is one of data/results: a row a run with task, recipe, seed, base_success, decorated_success, ... Two recipes are
+compared seed by seed, with the bootstrap interval of pdkit/claims.py and none below three seeds.
+"""
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+
+import numpy as np
+import pandas as pd
+
+from .claims import TooLittle, by_seed, difference, judged
+from .demos import Demos
+from .errors import PdkitError
+from .stats import Interval
+
+GRID = "alpha=0.1,H=20000"  # the ablations' recipe that is the lesson's
+RECORDED_STEPS = 40_000  # of every run of ablations.toml
+CELL = re.compile(r"alpha=([\d.]+),H=(\d+)")
+ENOUGH = 0.1  # ours: a setting works when it is less than 10 points behind the best
+VERDICTS = ("not", "partly", "reproduced")  # from the worst to the best
+
+
+# ---- differences -----------------------------------------------------------------------------------------------------
+
+def differences(table: pd.DataFrame, labels: Mapping[str, str], reference: str = "", column: str = "decorated_success") -> pd.DataFrame:
+    """Each recipe of `labels` less `reference` (left out: less the success of the policy that it starts from), seed by seed.
+
+    A row a recipe: recipe, label, seeds (pairs), value, low, high, as fractions. Recipes that are not recorded, or share no seed with
+    the reference, have no row; below three seeds low and high are NaN.
+    """
+    rows = []
+    for recipe, label in labels.items():
+        mine, theirs = _by_seed(table, recipe, column), _by_seed(table, reference or recipe, column if reference else "base_success")
+        values = (mine - theirs).dropna()
+        if recipe == reference or values.empty:
+            continue
+        try:
+            interval, _ = difference(mine, theirs)
+        except TooLittle:
+            interval = Interval(values.mean(), np.nan, np.nan)
+        rows.append({"recipe": recipe, "label": label, "seeds": len(values), **vars(interval)})
+    return pd.DataFrame(rows, columns=["recipe", "label", "seeds", "value", "low", "high"])
+
+
+def lines(rows: pd.DataFrame) -> list[str]:
+    """`differences` in words, a line each."""
+    return [f"{row.label}: {100 * row.value:+.1f} points" + (f" over {row.seeds} seeds, too few for an interval" if np.isnan(row.low) else
+            f" ({100 * row.low:+.1f} to {100 * row.high:+.1f}), {row.seeds} pairs") for row in rows.itertuples()]
+
+
+def _by_seed(table: pd.DataFrame, recipe: str, column: str) -> pd.Series:
+    """As claims.by_seed, but with however few seeds there are."""
+    return table[table.recipe == recipe].set_index(["task", "seed"])[column].astype(float).dropna()
+
+
+# ---- the grid of bound and schedule ----------------------------------------------------------------------------------
+
+def cell_name(alpha: float, H: int) -> str:
+    """What the sweep calls a cell of the grid."""
+    return f"alpha={float(alpha)},H={H}"
+
+
+def cell_of(alpha: float, H: int, total_steps: int, critic_input: str = "sum", actor_input: str = "obs") -> str:
+    """The recorded recipe that a run of another length corresponds to: H counts as a share of the steps, and inputs are named where
+    they differ from the lesson's (alone, where alpha and H do not)."""
+    cell = cell_name(alpha, round(RECORDED_STEPS * H / total_steps))
+    usual = (("critic_input", critic_input, "sum"), ("actor_input", actor_input, "obs"))
+    inputs = [f"{name}={value}" for name, value, lesson in usual if value != lesson]
+    return ",".join(inputs if inputs and cell == GRID else [cell, *inputs])
+
+
+def grid(table: pd.DataFrame, column: str = "decorated_success") -> pd.DataFrame:
+    """Mean of `column` over seeds, alpha (rows) by H (columns); NaN where no such recipe is recorded. Raises PdkitError without any."""
+    found = {recipe: CELL.fullmatch(recipe) for recipe in dict.fromkeys(table.recipe)}
+    rows = [{"alpha": float(m[1]), "H": int(m[2]), "value": table.loc[table.recipe == r, column].mean()} for r, m in found.items() if m]
+    if not rows:
+        raise PdkitError("These results hold no recipe called alpha=...,H=..., so there is no grid.")
+    return pd.DataFrame(rows).pivot(index="alpha", columns="H", values="value")
+
+
+def action_scales(demos: Demos) -> dict[str, float]:
+    """Two readings of "the action scale observed in the demonstration dataset" (appendix B.2), averaged over action dimensions and
+    clipped to [-1, 1]: the size of an action, mean |a|, and of a step between two, mean |a_t - a_(t-1)| inside an episode."""
+    episodes = [np.clip(episode["actions"], -1, 1) for episode in demos.episodes()]
+    steps = np.concatenate([np.abs(np.diff(actions, axis=0)) for actions in episodes])
+    return {"mean |a|": float(np.abs(np.concatenate(episodes)).mean()), "mean |a_t - a_(t-1)|": float(steps.mean())}
+
+
+def alpha_works(table: pd.DataFrame, scale: float, H: int = 20_000) -> tuple[str, Interval, str]:
+    """Appendix B.2: does the bound of the grid that is closest to `scale` (in ratio) work?
+
+    It works where it ends above the base policy *and* less than ENOUGH behind the best bound, both seed by seed; each is judged as
+    any claim (pdkit/claims.py), and the worse of the two is the verdict. Returns the verdict, the difference to the best bound
+    (0 for itself), and the recipe. Raises TooLittle below three seeds or two bounds at this H.
+    """
+    bounds = {}
+    for recipe in dict.fromkeys(table.recipe):
+        match = CELL.fullmatch(recipe)
+        if match and int(match[2]) == H:
+            bounds[recipe] = (float(match[1]), by_seed(table, recipe, "decorated_success"))
+    if len(bounds) < 2:
+        raise TooLittle(f"Fewer than two bounds are recorded with H={H}.")
+    near = min(bounds, key=lambda recipe: abs(np.log(bounds[recipe][0] / scale)))
+    best = max(bounds, key=lambda recipe: bounds[recipe][1].mean())
+    behind = Interval(0.0, 0.0, 0.0) if near == best else difference(bounds[near][1], bounds[best][1])[0]
+    gain, _ = difference(bounds[near][1], by_seed(table, near, "base_success"))
+    return min(judged(gain), judged(behind, -ENOUGH), key=VERDICTS.index), behind, near
