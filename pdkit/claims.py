@@ -1,4 +1,4 @@
-"""The rules by which recorded results are judged; pdkit/verdicts.py applies them to the paper's claims.
+"""The rules by which recorded results are judged; pdkit/verdicts applies them to the paper's claims.
 
 Every verdict follows one of few rules, so that no one is tempted to choose the rule that suits a result:
 

@@ -8,7 +8,7 @@ data/results/claims.csv has a row a claim:
               untested one, the paper's tasks    verdict   reproduced, partly, not or untested
                                                  command   that makes the numbers again
 
-`pdkit report --update` first computes every verdict anew for which there is a rule (pdkit/verdicts.py) and enough is recorded.
+`pdkit report --update` first computes every verdict anew for which there is a rule (pdkit/verdicts) and enough is recorded.
 A claim whose verdict is not "untested" has all of them. The recorded tables beside it (a row a run, with its command) are checked
 too: a report on broken tables is refused.
 """

@@ -162,7 +162,8 @@ def trainer(monkeypatch, **changes):
     monkeypatch.setitem(horizon.GUIDES, "corridor", None)
     monkeypatch.setattr(horizon, "ways_of", lambda task: ways())
     values = dict(total_steps=300, warmup_steps=100, num_envs=2, env_workers=0, eval_workers=0, eval_every=150, eval_episodes=4,
-                  log_every=0, checkpoint_every=0, demo_fraction=0.0, hidden=16, batch=16, H=100, train_limit=12, on_success="terminate", bf16=False,
+                  log_every=0, checkpoint_every=0, demo_fraction=0.0, hidden=16, batch=16, H=100, train_limit=12,
+                  on_success="terminate", bf16=False,
                   select="last")
     return Trainer(online_config("Door", "lesson", 0, **(values | changes)), zero_base(PROBES["corridor"]), None, PROBES["corridor"])
 

@@ -195,7 +195,7 @@ def test_table_11_is_judged_at_the_best_k_against_half_of_the_bet(results, vinn,
 
 
 def test_table_11_reproduced_on_all_tasks_only(results, monkeypatch):
-    monkeypatch.setattr(verdicts, "EIGHT", ("Door",))
+    monkeypatch.setattr(verdicts.methods, "EIGHT", ("Door",))
     pd.DataFrame({"task": "x", "recipe": "vinn", "seed": range(3), "vinn.GPT,k=1.value": [0.1, 0.2, 0.15], "bet.value": 0.9}).to_csv(
         results / "vinn.csv", index=False)
     assert verdict_of("VINN on features of the BeT's GPT")[0] == "reproduced"

@@ -3,7 +3,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from pdkit import claims, recorded, report, verdicts
+from pdkit import ablations, claims, recorded, report, verdicts
 from pdkit.files import DATA
 from pdkit.stats import Interval
 
@@ -82,7 +82,7 @@ def test_a_claim_about_more_tasks_is_partly_reproduced_at_most(results):
 
 
 CLOSE, FAR, EVEN = [0.94, 0.9, 0.92], [0.5, 0.6, 0.55], [0.95, 0.95, 0.95]
-GRID = verdicts.GRID
+GRID = ablations.GRID
 
 
 def verdict_of(start):
@@ -272,3 +272,31 @@ def test_what_a_lesson_cannot_reach_stays_untested():
 def test_the_shipped_claims_are_what_the_recorded_results_say():
     assert verdicts.updated(CLAIMS).equals(CLAIMS)
     assert set(verdicts.shown(CLAIMS, "E.2").section) == {"E.2"} and len(verdicts.shown(CLAIMS, "G.1")) == 4
+
+
+# ---- the horizon -----------------------------------------------------------------------------------------------------
+
+@pytest.mark.parametrize(("whole", "late", "verdict"), [(0.1, 0.6, "reproduced"), (0.1, 0.3, "partly"), (0.6, 0.6, "not")])
+def test_a_long_horizon_is_a_factor_where_fine_tuning_fails_on_the_whole_task_alone(results, whole, late, verdict):
+    parts = [runs(f"sac_finetune,start_fraction={f}", [end - 0.01, end, end + 0.01]) for f, end in ((0.0, whole), (0.5, 0.4), (0.75, late))]
+    write(results, "horizon", *parts, runs("policy_decorator,start_fraction=0.0", [0.9] * 3))
+    found = verdicts.find("A long task horizon is a key factor in the failure of fine-tuning baselines.")
+    assert (found.verdict, found.tasks, found.seeds) == (verdict, "Door", "0 1 2")
+    assert f"start at 0: gain {100 * (whole - 0.5):+.1f} points" in found.measured and found.command.endswith("sweeps/horizon.toml")
+
+
+@pytest.mark.parametrize(("rates", "verdict"), [([0.0, 0.5], "reproduced"), ([0.2, 0.2], "not"), ([0.4, 0.1], "not")])
+def test_random_exploration_against_the_horizon(results, rates, verdict):
+    columns = {"met.random actions.0": rates[0], "met.random actions.0.5": 0.9, "met.random actions.0.9": rates[1], "met.base.0": 0.7}
+    write(results, "exploration", pd.DataFrame({"seed": range(3), "recipe": "exploration", "task": "10"} | columns))
+    found = verdicts.find("With a longer horizon, random exploration meets the sparse reward less often.")
+    assert found.verdict == verdict and f"0.9: {100 * rates[1]:.1f} %" in found.measured
+
+
+@pytest.mark.parametrize(("updates", "verdict"), [
+    ([[100, 200, 400]] * 3, "reproduced"), ([[100, 90, 400], [100, 200, 400], [100, 200, 400]], "partly"), ([[400, 200, 100]] * 3, "not")])
+def test_the_reward_takes_longer_on_a_longer_way(results, updates, verdict):
+    rows = pd.DataFrame(updates, columns=[f"updates.1-step.{length}" for length in (5, 10, 40)])
+    write(results, "exploration", rows.assign(seed=range(3), recipe="exploration", task="10", **{"updates.5-step.5": 1.0}))
+    found = verdicts.find("With a longer horizon, the sparse reward takes longer to propagate through the trajectory.")
+    assert found.verdict == verdict and "40 steps" in found.measured

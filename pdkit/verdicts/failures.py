@@ -1,0 +1,269 @@
+"""Why fine-tuning fails (data/sweeps: calql, q_architectures, unlearning, warm_start, horizon, exploration)."""
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+
+from ..claims import (
+    LEAST_SEEDS,
+    Finding,
+    TooLittle,
+    by_seed,
+    compared,
+    difference,
+    efficiency,
+    finding,
+    judged,
+    mean_interval,
+    percent,
+    points,
+    recorded,
+    turned,
+)
+from ..horizon_analysis import by_fraction, failure_verdict
+from ..stats import Interval
+from .registry import EIGHT, measures
+
+# ---- Cal-QL, setups A to E (appendix F.3); E is the comparison's cell ---------------------------------------------------
+
+BOTH = "pdkit sweep data/sweeps/calql.toml; pdkit sweep data/sweeps/leaderboard.toml"  # setups A to D, and E
+
+
+@measures("A critic pre-trained by Cal-QL on demonstrations alone")
+def _() -> Finding:
+    """Limited: setup E ends less than 10 points (ours) above fine-tuning by SAC with critics from scratch."""
+    table, _ = recorded("leaderboard")
+    with_it, without = (by_seed(table, recipe, "decorated_success") for recipe in ("calql", "sac_finetune"))
+    interval, values = difference(with_it, without)
+    return finding("leaderboard", values, f"Cal-QL {percent(with_it.mean())}, SAC fine-tuning {percent(without.mean())}: "
+                   f"{100 * interval.value:+.1f} points", points(interval), judged(turned(interval), -0.1))
+
+
+def _efficiency(first: str, second: str) -> tuple[Interval, pd.Series, str]:
+    """Difference of the mean success over all evaluations of the online stage; and in words."""
+    _, curves = recorded("calql")
+    one, two = efficiency(curves, first), efficiency(curves, second)
+    interval, values = difference(one, two)
+    return interval, values, f"mean success over the online evaluations {percent(one.mean())} and {percent(two.mean())}"
+
+
+@measures("Cal-QL needs negative trajectories")
+def _() -> Finding:
+    """A lot: A is ahead of B by more than 10 points (ours) of the mean success over the evaluations of the online stage."""
+    interval, values, told = _efficiency("calql_a", "calql_b")
+    return finding("calql", values, f"A and B: {told}", points(interval), judged(interval, 0.1))
+
+
+@measures("SAC in place of Cal-QL online costs slightly in sample efficiency")
+def _() -> Finding:
+    """Slightly: less than 10 points (ours) of the mean success over the online evaluations; and C's last policies exceed 90 %."""
+    interval, values, told = _efficiency("calql_b", "calql_c")
+    ends = by_seed(recorded("calql")[0], "calql_c", "decorated_success")
+    high = mean_interval(ends)
+    both = {judged(turned(interval), -0.1), judged(high, 0.9)}
+    return finding("calql", values, f"B and C: {told}; C ends at {percent(ends.mean())}",
+                   f"cost {points(interval)}; C {percent(high.low)} to {percent(high.high)}", both.pop() if len(both) == 1 else "partly")
+
+
+@measures("SAC in place of Cal-QL online saves significant wall-clock time")
+def _() -> Finding:
+    """Significant: B's training takes more than 1.25 times as long as C's (ours), the offline stage that both share included."""
+    table, _ = recorded("calql")
+    ratios = np.log(by_seed(table, "calql_b", "train_minutes") / by_seed(table, "calql_c", "train_minutes")).dropna()
+    if ratios.index.get_level_values("seed").nunique() < LEAST_SEEDS:
+        raise TooLittle("Fewer than three seeds are recorded on both sides.")
+    interval = mean_interval(ratios)
+    value, low, high = np.exp([interval.value, interval.low, interval.high])
+    return finding("calql", ratios, f"training with Cal-QL online (B) takes {value:.2f} times as long as with SAC (C)",
+                   f"{low:.2f} to {high:.2f} times (percentile bootstrap over seeds, 95 %)", judged(interval, float(np.log(1.25))))
+
+
+@measures("A large GPT actor does worse than a small MLP actor")
+def _() -> Finding:
+    return compared("calql", "calql_d", "calql_c", sign=-1, names=("GPT (D)", "MLP (C)"))
+
+
+@measures("A pre-trained BeT actor outperforms a randomly initialised GPT actor")
+def _() -> Finding:
+    """E and D come from two sweeps with the same budget, seeds and test episodes."""
+    bet = by_seed(recorded("leaderboard")[0], "calql", "decorated_success")
+    gpt = by_seed(recorded("calql")[0], "calql_d", "decorated_success")
+    interval, values = difference(bet, gpt)
+    found = finding("calql", values, f"BeT (E) {percent(bet.mean())}, GPT (D) {percent(gpt.mean())}: {100 * interval.value:+.1f} points",
+                    points(interval), judged(interval))
+    return replace(found, command=BOTH)
+
+
+# ---- the architecture of the critic (appendix F.5.1) -------------------------------------------------------------------
+
+def _gain(recipe: str) -> tuple[Interval, pd.Series]:
+    """What runs of this architecture gain over the policy that they started from."""
+    table, _ = recorded("q_architectures")
+    return difference(by_seed(table, recipe, "decorated_success"), by_seed(table, recipe, "base_success"))
+
+
+def _largest_gain(method: str, kinds: Sequence[str]) -> tuple[Interval, pd.Series, str]:
+    """That of the architecture with the largest mean; and all of them in words."""
+    found = {kind: _gain(f"{method},critic_backbone={kind}") for kind in kinds}
+    told = ", ".join(f"{kind} {100 * interval.value:+.1f}" for kind, (interval, _) in found.items())
+    interval, values = max(found.values(), key=lambda gain: gain[0].value)
+    return interval, values, f"points gained over the base policy: {told}"
+
+
+@measures("SAC fine-tuning with an MLP critic slightly improves")
+def _() -> Finding:
+    """Slightly: above 0; a mean gain of more than 20 points (ours) is more than the claim says, and counts as partly."""
+    interval, values, told = _largest_gain("sac_finetune", ["mlp"])
+    verdict = judged(interval)
+    return finding("q_architectures", values, told, points(interval),
+                   "partly" if verdict == "reproduced" and interval.value > 0.2 else verdict)
+
+
+@measures("SAC fine-tuning with a critic on the shared or a separate GPT backbone")
+def _() -> Finding:
+    """No improvement: even the larger of the two gains stays below 5 points (ours)."""
+    interval, values, told = _largest_gain("sac_finetune", ["shared", "separate"])
+    return finding("q_architectures", values, told, f"the larger one: {points(interval)}", judged(turned(interval), -0.05))
+
+
+@measures("PPO fine-tuning performs poorly with all three")
+def _() -> Finding:
+    """Poorly: even the best of the three ends below the base policy."""
+    interval, values, told = _largest_gain("ppo_finetune", ["mlp", "shared", "separate"])
+    return finding("q_architectures", values, told, f"the best one: {points(interval)}", judged(turned(interval)))
+
+
+# ---- notebooks with five seeds (unlearning, warm start) ----------------------------------------------------------------
+
+def _unlearning(task: str) -> pd.DataFrame:
+    table, _ = recorded("unlearning")
+    return table[table.task == task].assign(recipe="x")
+
+
+@measures("After 100 updates with a random critic")
+def _() -> Finding:
+    """Success falls while the cube is still lifted in most episodes in which it was (most: more than half, ours)."""
+    rows = _unlearning("StackCube")
+    before, after, lifts, kept = (by_seed(rows, "x", name) for name in (
+        "success.before.value", "success.random critic, 100.value", "lifted.before", "lifted.random critic, 100"))
+    fall, values = difference(before, after)
+    share = mean_interval(kept / lifts)
+    both = {judged(fall), judged(share, 0.5)}
+    return finding("unlearning", values, f"success {percent(before.mean())} before, {percent(after.mean())} after; cube lifted "
+                   f"{percent(lifts.mean())} before, {percent(kept.mean())} after", f"fall {points(fall)}",
+                   both.pop() if len(both) == 1 else "partly")
+
+
+@measures("After 200 updates with a random critic")
+def _() -> Finding:
+    """The cube is lifted in less than half of the episodes in which it was."""
+    rows = _unlearning("StackCube")
+    lifts, kept = by_seed(rows, "x", "lifted.before"), by_seed(rows, "x", "lifted.random critic, 200")
+    share = mean_interval(kept / lifts)
+    return finding("unlearning", kept, f"cube lifted {percent(lifts.mean())} before, {percent(kept.mean())} after",
+                   f"{percent(share.low)} to {percent(share.high)} of what it was (percentile bootstrap over seeds, 95 %)",
+                   judged(turned(share), -0.5))
+
+
+@measures("The BeT modified for fine-tuning")
+def _() -> Finding:
+    """Like the original: the mean difference, with its interval, lies within 10 points (ours)."""
+    rows = _unlearning("Door")
+    ours, theirs = by_seed(rows, "x", "original.other.value"), by_seed(rows, "x", "original.base.value")
+    interval, values = difference(ours, theirs)
+    inside = -0.1 < interval.low and interval.high < 0.1
+    return finding("unlearning", values, f"modified {percent(ours.mean())}, original {percent(theirs.mean())}: "
+                   f"{100 * interval.value:+.1f} points", points(interval),
+                   "reproduced" if inside else "partly" if abs(interval.value) < 0.1 else "not", EIGHT)
+
+
+@measures("Gradients of a randomly initialised critic")
+def _() -> Finding:
+    """Noise: the mean cosine with the direction that would help, over five random critics a run, does not differ from 0 by 0.1 (ours)."""
+    table, _ = recorded("unlearning")
+    values, drift = (by_seed(table.assign(recipe="x"), "x", name) for name in ("cosine_random", "drift.random critic"))
+    interval = mean_interval(values)
+    inside = max(abs(interval.low), abs(interval.high)) < 0.1
+    return finding("unlearning", values, f"mean cosine with the improving direction {interval.value:+.3f}; drift after 200 updates "
+                   f"{drift.mean():.3f} of the action's unit", f"cosine {interval.low:+.3f} to {interval.high:+.3f} (percentile bootstrap "
+                   "over seeds, 95 %)", "reproduced" if inside and drift.min() > 0 else "partly" if abs(interval.value) < 0.1 else "not")
+
+
+@measures("Warm-starting the critic makes")
+def _() -> Finding:
+    """Massively: the temperature more than doubles, and more than twice as much as without a warm start; |Q| likewise (notebook 07)."""
+    table, _ = recorded("warm_start")
+    rows = table.assign(recipe="x", task="Door")
+    rises = np.log2(by_seed(rows, "x", "runs.warm.temperature") / np.maximum(1.0, by_seed(rows, "x", "runs.vanilla.temperature")))
+    q = np.log2(by_seed(rows, "x", "runs.warm.q") / by_seed(rows, "x", "runs.vanilla.q"))
+    first, second = mean_interval(rises), mean_interval(q)
+    both = {judged(first, 1.0), judged(second, 1.0)}
+    return finding("warm_start", rises, f"temperature {2 ** first.value:.2f} times, mean |Q| {2 ** second.value:.1f} times what they are "
+                   "without a warm start", f"{2 ** first.low:.2f} to {2 ** first.high:.2f} and {2 ** second.low:.1f} to "
+                   f"{2 ** second.high:.1f} times (percentile bootstrap over seeds, 95 %)",
+                   both.pop() if len(both) == 1 else "partly")
+
+
+@measures("With a warm start and a fixed entropy coefficient, the training of the critic is very unstable")
+def _() -> Finding:
+    """Unstable: mean |Q| leaves what rewards alone can be worth (ours; the paper shows the critic's loss)."""
+    table, _ = recorded("warm_start")
+    rows = table.assign(recipe="x", task="Door")
+    ratio = np.log(by_seed(rows, "x", "runs.fixed.q") / by_seed(rows, "x", "rewards_alone"))
+    interval = mean_interval(ratio)
+    low, high = np.exp([interval.low, interval.high])
+    return finding("warm_start", ratio, f"largest mean |Q| {np.exp(interval.value):.1f} times the largest worth of rewards",
+                   f"{low:.1f} to {high:.1f} times (percentile bootstrap over seeds, 95 %)", judged(interval))
+
+
+# ---- the horizon (F.1, F.4; notebook 10) -------------------------------------------------------------------------------
+
+@measures("A long task horizon is a key factor")
+def _() -> Finding:
+    """horizon_analysis.failure_verdict: fine-tuning ends below its base policy on the whole task, not where episodes start late."""
+    table, _ = recorded("horizon")
+    rows = by_fraction(table)
+    rows = rows[rows.method == "sac_finetune"]
+    ends = rows.start_fraction.min(), rows.start_fraction.max()
+    whole, short = (by_seed(rows[rows.start_fraction == end].assign(recipe="x"), "x", "gain") for end in ends)
+    verdict, _ = failure_verdict(rows)
+    interval, values = difference(short, whole)
+    told = "; ".join(f"start at {f:g}: gain {100 * part.gain.mean():+.1f} points" for f, part in rows.groupby("start_fraction"))
+    return finding("horizon", values, f"SAC fine-tuning over its base, by the share of the way that lies behind: {told}",
+                   f"latest less whole: {points(interval)}", verdict)
+
+
+@measures("With a longer horizon, random exploration")
+def _() -> Finding:
+    """Share of episodes with a reward under random actions: higher from the latest start than on the whole task."""
+    table, _ = recorded("exploration")
+    rows = table.assign(recipe="x", task="Door")
+    rates = {float(name.removeprefix("met.random actions.")): name for name in rows if name.startswith("met.random actions.")}
+    if len(rates) < 2:
+        raise TooLittle("Fewer than two horizons are recorded.")
+    whole, late = (by_seed(rows, "x", rates[end]) for end in (min(rates), max(rates)))
+    interval, values = difference(late, whole)
+    told = ", ".join(f"{f:g}: {percent(rows[name].mean())}" for f, name in sorted(rates.items()))
+    return finding("exploration", values, f"episodes with a reward under random actions, by the share of the way that lies behind: {told}",
+                   f"latest less whole: {points(interval)}", judged(interval))
+
+
+@measures("With a longer horizon, the sparse reward takes longer")
+def _() -> Finding:
+    """Updates (1-step returns) until a corridor is valued right: more for each longer corridor, in every seed."""
+    table, _ = recorded("exploration")
+    rows = table.assign(recipe="x", task="Door")
+    columns = {int(name.removeprefix("updates.1-step.")): name for name in rows if name.startswith("updates.1-step.")}
+    if len(columns) < 2:
+        raise TooLittle("Fewer than two corridors are recorded.")
+    ratio = np.log(by_seed(rows, "x", columns[max(columns)]) / by_seed(rows, "x", columns[min(columns)]))
+    interval = mean_interval(ratio)
+    grows = rows[[columns[length] for length in sorted(columns)]].diff(axis=1).iloc[:, 1:].gt(0).all(axis=None)
+    low, high = np.exp([interval.low, interval.high])
+    told = ", ".join(f"{length} steps: {rows[name].mean():,.0f}" for length, name in sorted(columns.items()))
+    return finding("exploration", ratio, f"updates until a corridor is valued right: {told}",
+                   f"longest against shortest {low:.1f} to {high:.1f} times (percentile bootstrap over seeds, 95 %)",
+                   judged(interval) if grows else "not" if interval.value <= 0 else "partly")
