@@ -250,6 +250,7 @@ def trade_figure(table: pd.DataFrame, *, x: str = "jerk", y: str = "success", la
         ax.plot(*place, "X", ms=10, color="black", mec="white", zorder=4)
         ax.annotate(f"start: {name}", place, (7, -11), textcoords="offset points", fontsize=8.5)
     ax.set_xscale("log")
+    ax.xaxis.set_major_locator(mpl.ticker.LogLocator(subs=(1, 2, 5)))
     ax.xaxis.set_major_formatter(mpl.ticker.FuncFormatter(lambda value, _: f"{value:,.3g}" if value < 1000 else f"{value:,.0f}"))
     ax.xaxis.set_minor_formatter(mpl.ticker.NullFormatter())
     _values(ax, "y", y, "success" if "success" in y else "", False)
