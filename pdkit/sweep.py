@@ -279,6 +279,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--address", metavar="CLUSTER", help="use the Ray cluster at this address")
     parser.add_argument("--record", metavar="NAME", help="add the finished rows to data/results/NAME.csv (default: the spec's `record`)")
     parser.add_argument("--seeds", type=int, nargs="+", metavar="SEED", help="only these of the spec's seeds")
+    parser.add_argument("--recipes", nargs="+", metavar="RECIPE", help="only these of its cells, by their recipe (--dry-run shows them)")
     parser.add_argument("--missing", action="store_true", help="leave out what data/results has already, from whichever machine")
     parser.add_argument("--dry-run", action="store_true", help="list the jobs and run nothing")
     args = parser.parse_args(argv)
@@ -290,10 +291,11 @@ def main(argv: list[str]) -> int:
         must_be_installed()
     spec = load_spec(args.spec)
     jobs, name = make_jobs(spec), args.record or spec.record
-    if args.seeds:
-        jobs = [job for job in jobs if job.labels["seed"] in args.seeds]
-        if not jobs:
-            raise PdkitError(f"{spec.path.name} has none of the seeds {' '.join(map(str, args.seeds))}.")
+    for wanted, label in ((args.seeds, "seed"), (args.recipes, "recipe")):
+        absent = [value for value in wanted or [] if value not in {job.labels[label] for job in jobs}]
+        if absent:
+            raise PdkitError(f"{spec.path.name} has no {label} {absent[0]}.")
+        jobs = [job for job in jobs if not wanted or job.labels[label] in wanted]
     if args.missing:
         jobs = missing(jobs, name)
     if args.dry_run:

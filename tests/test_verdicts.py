@@ -274,6 +274,16 @@ def test_the_shipped_claims_are_what_the_recorded_results_say():
     assert set(verdicts.shown(CLAIMS, "E.2").section) == {"E.2"} and len(verdicts.shown(CLAIMS, "G.1")) == 4
 
 
+@pytest.mark.parametrize(("warm", "verdict"), [(0.1, "reproduced"), (0.5, "not")])
+def test_a_warm_start_is_judged_by_all_evaluations(results, warm, verdict):
+    """All runs end at 0: what they keep until then tells them apart."""
+    curves = pd.concat(pd.DataFrame({"task": "Door", "recipe": recipe, "seed": seed, "step": [5_000, 10_000], "success_once": [first, 0.0]})
+                       for recipe, first in (("vanilla", 0.3), ("warm-fixed", warm)) for seed in range(3))
+    write(results, "warm_finetuning", runs("vanilla", [0.0] * 3), runs("warm-fixed", [0.0] * 3), curves=curves)
+    found = verdicts.find("Fine-tuning without a warm start outperforms fine-tuning with a warm start and a fixed entropy coefficient.")
+    assert found.verdict == verdict and f"without 15.0 %, with a warm start and a fixed temperature {50 * warm:.1f} %" in found.measured
+
+
 # ---- the horizon -----------------------------------------------------------------------------------------------------
 
 @pytest.mark.parametrize(("whole", "late", "verdict"), [(0.1, 0.6, "reproduced"), (0.1, 0.3, "partly"), (0.6, 0.6, "not")])

@@ -207,6 +207,16 @@ def _() -> Finding:
                    both.pop() if len(both) == 1 else "partly")
 
 
+@measures("Fine-tuning without a warm start outperforms")
+def _() -> Finding:
+    """By the mean success over all evaluations: at the end both may have lost everything."""
+    _, curves = recorded("warm_finetuning")
+    plain, warm = efficiency(curves, "vanilla"), efficiency(curves, "warm-fixed")
+    interval, values = difference(plain, warm)
+    return finding("warm_finetuning", values, f"mean success over all evaluations: without {percent(plain.mean())}, with a warm start and "
+                   f"a fixed temperature {percent(warm.mean())}: {100 * interval.value:+.1f} points", points(interval), judged(interval))
+
+
 @measures("With a warm start and a fixed entropy coefficient, the training of the critic is very unstable")
 def _() -> Finding:
     """Unstable: mean |Q| leaves what rewards alone can be worth (ours; the paper shows the critic's loss)."""
