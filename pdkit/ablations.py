@@ -1,7 +1,7 @@
 """One change at a time: the grid of bound and schedule, and differences from a reference recipe (notebook 13; appendix B.2, E, G.1).
 
 A table of runs is one of data/results: a row a run with task, recipe, seed, base_success, decorated_success, ... Two recipes are
-compared seed by seed, with the bootstrap interval of pdkit/claims.py and none below three seeds.
+compared seed by seed, with the interval of pdkit/claims.py and none below three seeds.
 """
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from collections.abc import Mapping
 import numpy as np
 import pandas as pd
 
-from .claims import TooLittle, by_seed, difference, judged
+from .claims import TooLittle, by_seed, difference, judged, weakest
 from .demos import Demos
 from .errors import PdkitError
 from .stats import Interval
@@ -20,7 +20,6 @@ GRID = "alpha=0.1,H=20000"  # the ablations' recipe that is the lesson's
 RECORDED_STEPS = 40_000  # of every run of ablations.toml
 CELL = re.compile(r"alpha=([\d.]+),H=(\d+)")
 ENOUGH = 0.1  # ours: a setting works when it is less than 10 points behind the best
-VERDICTS = ("not", "partly", "reproduced")  # from the worst to the best
 
 
 # ---- differences -----------------------------------------------------------------------------------------------------
@@ -107,4 +106,4 @@ def alpha_works(table: pd.DataFrame, scale: float, H: int = 20_000) -> tuple[str
     best = max(bounds, key=lambda recipe: bounds[recipe][1].mean())
     behind = Interval(0.0, 0.0, 0.0) if near == best else difference(bounds[near][1], bounds[best][1])[0]
     gain, _ = difference(bounds[near][1], by_seed(table, near, "base_success"))
-    return min(judged(gain), judged(behind, -ENOUGH), key=VERDICTS.index), behind, near
+    return weakest(judged(gain), judged(behind, -ENOUGH)), behind, near

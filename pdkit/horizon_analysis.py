@@ -18,11 +18,12 @@ import pandas as pd
 import torch
 import torch.nn.functional as F
 
+from .claims import TooLittle, by_seed, difference, judged, mean_interval, turned, weakest
 from .errors import PdkitError
 from .evaluate import Actor
 from .rl.networks import Critics
 from .rl.replay import NStep, Replay
-from .stats import Interval, stratified_bootstrap, wilson
+from .stats import wilson
 from .tasks.horizon import horizon_spec, steps_ahead, ways_of
 from .tasks.lanes import IDLE
 from .tasks.spec import TaskSpec
@@ -125,9 +126,14 @@ def by_fraction(table: pd.DataFrame) -> pd.DataFrame:
                         gain=table.decorated_success - table.base_success)
 
 
-def interval_of(values: Sequence[float]) -> Interval:
-    """The mean with its bootstrap interval over runs."""
-    return stratified_bootstrap(lambda x: float(x.mean()), np.asarray(values, float)[:, None], seed=0)
+def end_gains(table: pd.DataFrame, method: str = "sac_finetune") -> tuple[pd.Series, pd.Series]:
+    """Gains of `by_fraction` rows of one method by (task, seed): on the whole task, and from the latest start. Raises TooLittle."""
+    rows = table[table.method == method]
+    ends = rows.start_fraction.min(), rows.start_fraction.max()
+    if rows.empty or ends[0] == ends[1]:
+        raise TooLittle(f"Fewer than two horizons of {method} are recorded.")
+    whole, short = (by_seed(rows[rows.start_fraction == end].assign(recipe=method), method, "gain") for end in ends)
+    return whole, short
 
 
 # ---- verdicts --------------------------------------------------------------------------------------------------------
@@ -168,24 +174,18 @@ def propagation_verdict(table: pd.DataFrame) -> tuple[str, list[str]]:
 def failure_verdict(table: pd.DataFrame, method: str = "sac_finetune") -> tuple[str, list[str]]:
     """"A long task horizon is a key factor in the failure of fine-tuning" (F.4), from `by_fraction` rows of one method.
 
-    It fails at a horizon when the interval of its mean gain over the base policy lies below 0. reproduced: it fails on the whole task,
-    does not at the shortest horizon, and the interval of the difference of gains lies above 0. partly: that difference lies above 0,
-    but it fails at both ends or at neither. not: no such difference. untested: fewer than two runs at one of the ends.
+    By the rules of pdkit/claims.py, seed by seed: it fails where the whole interval of its gain over the base policy lies below 0.
+    reproduced: it fails on the whole task, not from the latest start, and the difference of the two gains lies above 0 with its whole
+    interval. partly: the mean difference lies above 0. not: it does not. untested: too few horizons or seeds.
     """
-    rows = table[table.method == method]
-    gains = {f: part.gain.to_numpy() for f, part in rows.groupby("start_fraction")}
-    said = [f"start at {f:g} of the way: base {part.base_success.mean():.0%}, gain {_points(interval_of(part.gain))} ({len(part)} seeds)"
-            for f, part in rows.groupby("start_fraction")]
-    if len(gains) < 2 or min(len(gains[min(gains)]), len(gains[max(gains)])) < 2:
+    said = [f"start at {f:g} of the way: base {part.base_success.mean():.0%}, gain {100 * part.gain.mean():+.0f} points ({len(part)} seeds)"
+            for f, part in table[table.method == method].groupby("start_fraction")]
+    try:
+        whole, short = end_gains(table, method)
+        interval, _ = difference(short, whole)
+    except TooLittle:
         return "untested", said
-    whole, short = gains[min(gains)], gains[max(gains)]
-    difference = stratified_bootstrap(lambda a, b: float(a.mean() - b.mean()), short[:, None], whole[:, None], seed=0)
-    said.append(f"shortest minus longest horizon: {_points(difference)}")
-    if difference.low <= 0:
-        return "not", said
-    fails, fails_short = (interval_of(x).high < 0 for x in (whole, short))
-    return ("reproduced" if fails and not fails_short else "partly"), said
-
-
-def _points(interval: Interval) -> str:
-    return f"{100 * interval.value:+.0f} points ({100 * interval.low:+.0f} to {100 * interval.high:+.0f})"
+    said.append(f"latest start less the whole task: {100 * interval.value:+.0f} points ({100 * interval.low:+.0f} to "
+                f"{100 * interval.high:+.0f})")
+    fails, fails_short = (judged(turned(mean_interval(gains))) == "reproduced" for gains in (whole, short))
+    return weakest(judged(interval), "reproduced" if fails and not fails_short else "partly"), said

@@ -4,16 +4,17 @@ A recipe keeps its colour in every figure of a notebook when both are given the 
 """
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import matplotlib as mpl
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 
+from .claims import LEAST_SEEDS
 from .errors import PdkitError
 from .plots import COLORS, Picture, _columns, _percent, blank, styled
-from .stats import iqm, stratified_bootstrap
+from .stats import Interval, iqm, stratified_bootstrap
 
 PALETTE = ["#1f6fb4", "#d1495b", "#2c9f6b", "#e0a030", "#7a4fa3", "#17a2b8", "#a8542a", "#e377c2", "#5f6b1f", "#3c3c46", "#9cc3e6",
            "#f4a6a0", "#98cfa9", "#c7b42c", "#5b4a8a"]
@@ -39,10 +40,17 @@ def summary(table: pd.DataFrame, column: str = "decorated_success", labels: dict
         values = table.loc[table.recipe == recipe, column].dropna().to_numpy()
         if not len(values):
             continue
-        interval = stratified_bootstrap(iqm, values[:, None], seed=BOOTSTRAP_SEED)
+        interval = over_seeds(iqm, values)
         rows.append({"recipe": recipe, "label": label, "seeds": len(values), "mean": values.mean(), "iqm": interval.value,
                      "low": interval.low, "high": interval.high})
     return pd.DataFrame(rows)
+
+
+def over_seeds(statistic: Callable[[np.ndarray], float], values: np.ndarray) -> Interval:
+    """A statistic of runs (N,) with its bootstrap interval, which is NaN below three: one or two values would give one of no width."""
+    if len(values) < LEAST_SEEDS:
+        return Interval(float(statistic(values)), np.nan, np.nan)
+    return stratified_bootstrap(statistic, values[:, None], seed=BOOTSTRAP_SEED, repetitions=500)
 
 
 @styled
@@ -185,8 +193,7 @@ def _band(ax: Axes, curves: pd.DataFrame, recipe: str, column: str, color: str, 
         return
     rows = rows.assign(number=rows.groupby("seed").cumcount())  # seeds are logged a few steps apart: n-th belongs to n-th
     step = rows.groupby("number").step.mean()
-    limits = [stratified_bootstrap(np.mean, values.to_numpy()[:, None], seed=BOOTSTRAP_SEED, repetitions=500)
-              for _, values in rows.groupby("number")[column]]
+    limits = [over_seeds(np.mean, values.to_numpy()) for _, values in rows.groupby("number")[column]]
     ax.plot(step, [i.value for i in limits], "-o", ms=3.5, color=color, label=f"{label} ({rows.seed.nunique()})")
     ax.fill_between(step, [i.low for i in limits], [i.high for i in limits], color=color, alpha=0.15, lw=0)
 

@@ -199,7 +199,7 @@ def _episodes(actor: Policy | Decorated, spec: TaskSpec, episodes: int) -> pd.Da
 
 def _base_episodes(base: Policy, spec: TaskSpec, episodes: int, config: OnlineConfig, weights: str) -> pd.DataFrame:
     """The base policy's test episodes: the same for every method and seed that starts from it, so they are run once and kept."""
-    what = json.dumps([spec.name, config.start_fraction, episodes, weights, describe_machine()["versions"]])
+    what = json.dumps([spec.name, config.start_fraction, episodes, weights, base.kind, base.config, describe_machine()["versions"]])
     kept = runs_root() / "base_episodes" / f"{spec.name}-{hashlib.sha256(what.encode()).hexdigest()[:16]}.csv"
     if not kept.exists():
         table = _episodes(base, spec, episodes)

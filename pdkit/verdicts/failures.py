@@ -9,21 +9,26 @@ import pandas as pd
 
 from ..claims import (
     LEAST_SEEDS,
+    METHOD,
     Finding,
     TooLittle,
     by_seed,
     compared,
     difference,
     efficiency,
+    evaluations,
     finding,
+    jointly,
     judged,
     mean_interval,
     percent,
     points,
     recorded,
+    times,
+    told_apart,
     turned,
 )
-from ..horizon_analysis import by_fraction, failure_verdict
+from ..horizon_analysis import by_fraction, end_gains, failure_verdict
 from ..stats import Interval
 from .registry import EIGHT, measures
 
@@ -34,18 +39,24 @@ BOTH = "pdkit sweep data/sweeps/calql.toml; pdkit sweep data/sweeps/leaderboard.
 
 @measures("A critic pre-trained by Cal-QL on demonstrations alone")
 def _() -> Finding:
-    """Limited: setup E ends less than 10 points (ours) above fine-tuning by SAC with critics from scratch."""
-    table, _ = recorded("leaderboard")
-    with_it, without = (by_seed(table, recipe, "decorated_success") for recipe in ("calql", "sac_finetune"))
-    interval, values = difference(with_it, without)
-    return finding("leaderboard", values, f"Cal-QL {percent(with_it.mean())}, SAC fine-tuning {percent(without.mean())}: "
-                   f"{100 * interval.value:+.1f} points", points(interval), judged(turned(interval), -0.1))
+    """Limited: setup E lies less than 10 points (ours) above fine-tuning by SAC with critics from scratch, at the end and over all
+    evaluations: at the end both may have lost everything."""
+    table, curves = recorded("leaderboard")
+    ends, ways = ([of(recipe) for recipe in ("calql", "sac_finetune")] for of in (
+        lambda recipe: by_seed(table, recipe, "decorated_success"), lambda recipe: efficiency(curves, recipe)))
+    told_apart(*ends, *ways)
+    (end, values), (way, _) = difference(*ends), difference(*ways)
+    return finding("leaderboard", values, f"Cal-QL and SAC fine-tuning: at the end {percent(ends[0].mean())}, {percent(ends[1].mean())}; "
+                   f"over all evaluations {percent(ways[0].mean())}, {percent(ways[1].mean())}",
+                   f"at the end {points(end)}; over all evaluations {points(way)}",
+                   jointly(judged(turned(end), -0.1), judged(turned(way), -0.1)))
 
 
 def _efficiency(first: str, second: str) -> tuple[Interval, pd.Series, str]:
     """Difference of the mean success over all evaluations of the online stage; and in words."""
     _, curves = recorded("calql")
     one, two = efficiency(curves, first), efficiency(curves, second)
+    told_apart(one, two)
     interval, values = difference(one, two)
     return interval, values, f"mean success over the online evaluations {percent(one.mean())} and {percent(two.mean())}"
 
@@ -63,9 +74,9 @@ def _() -> Finding:
     interval, values, told = _efficiency("calql_b", "calql_c")
     ends = by_seed(recorded("calql")[0], "calql_c", "decorated_success")
     high = mean_interval(ends)
-    both = {judged(turned(interval), -0.1), judged(high, 0.9)}
     return finding("calql", values, f"B and C: {told}; C ends at {percent(ends.mean())}",
-                   f"cost {points(interval)}; C {percent(high.low)} to {percent(high.high)}", both.pop() if len(both) == 1 else "partly")
+                   f"cost {points(interval)}; C {percent(high.low)} to {percent(high.high)}",
+                   jointly(judged(turned(interval), -0.1), judged(high, 0.9)))
 
 
 @measures("SAC in place of Cal-QL online saves significant wall-clock time")
@@ -76,9 +87,8 @@ def _() -> Finding:
     if ratios.index.get_level_values("seed").nunique() < LEAST_SEEDS:
         raise TooLittle("Fewer than three seeds are recorded on both sides.")
     interval = mean_interval(ratios)
-    value, low, high = np.exp([interval.value, interval.low, interval.high])
-    return finding("calql", ratios, f"training with Cal-QL online (B) takes {value:.2f} times as long as with SAC (C)",
-                   f"{low:.2f} to {high:.2f} times (percentile bootstrap over seeds, 95 %)", judged(interval, float(np.log(1.25))))
+    return finding("calql", ratios, f"training with Cal-QL online (B) takes {np.exp(interval.value):.2f} times as long as with SAC (C)",
+                   times(interval), judged(interval, float(np.log(1.25))))
 
 
 @measures("A large GPT actor does worse than a small MLP actor")
@@ -91,6 +101,7 @@ def _() -> Finding:
     """E and D come from two sweeps with the same budget, seeds and test episodes."""
     bet = by_seed(recorded("leaderboard")[0], "calql", "decorated_success")
     gpt = by_seed(recorded("calql")[0], "calql_d", "decorated_success")
+    told_apart(bet, gpt)
     interval, values = difference(bet, gpt)
     found = finding("calql", values, f"BeT (E) {percent(bet.mean())}, GPT (D) {percent(gpt.mean())}: {100 * interval.value:+.1f} points",
                     points(interval), judged(interval))
@@ -151,10 +162,9 @@ def _() -> Finding:
         "success.before.value", "success.random critic, 100.value", "lifted.before", "lifted.random critic, 100"))
     fall, values = difference(before, after)
     share = mean_interval(kept / lifts)
-    both = {judged(fall), judged(share, 0.5)}
     return finding("unlearning", values, f"success {percent(before.mean())} before, {percent(after.mean())} after; cube lifted "
                    f"{percent(lifts.mean())} before, {percent(kept.mean())} after", f"fall {points(fall)}",
-                   both.pop() if len(both) == 1 else "partly")
+                   jointly(judged(fall), judged(share, 0.5)))
 
 
 @measures("After 200 updates with a random critic")
@@ -164,7 +174,7 @@ def _() -> Finding:
     lifts, kept = by_seed(rows, "x", "lifted.before"), by_seed(rows, "x", "lifted.random critic, 200")
     share = mean_interval(kept / lifts)
     return finding("unlearning", kept, f"cube lifted {percent(lifts.mean())} before, {percent(kept.mean())} after",
-                   f"{percent(share.low)} to {percent(share.high)} of what it was (percentile bootstrap over seeds, 95 %)",
+                   f"{percent(share.low)} to {percent(share.high)} of what it was ({METHOD})",
                    judged(turned(share), -0.5))
 
 
@@ -200,21 +210,31 @@ def _() -> Finding:
     rises = np.log2(by_seed(rows, "x", "runs.warm.temperature") / np.maximum(1.0, by_seed(rows, "x", "runs.vanilla.temperature")))
     q = np.log2(by_seed(rows, "x", "runs.warm.q") / by_seed(rows, "x", "runs.vanilla.q"))
     first, second = mean_interval(rises), mean_interval(q)
-    both = {judged(first, 1.0), judged(second, 1.0)}
     return finding("warm_start", rises, f"temperature {2 ** first.value:.2f} times, mean |Q| {2 ** second.value:.1f} times what they are "
                    "without a warm start", f"{2 ** first.low:.2f} to {2 ** first.high:.2f} and {2 ** second.low:.1f} to "
-                   f"{2 ** second.high:.1f} times (percentile bootstrap over seeds, 95 %)",
-                   both.pop() if len(both) == 1 else "partly")
+                   f"{2 ** second.high:.1f} times ({METHOD})",
+                   jointly(judged(first, 1.0), judged(second, 1.0)))
+
+
+WARM_UPDATES = 625  # of data/sweeps/warm_finetuning.toml: the distance of two evaluations, so that both arms meet at equal ages
 
 
 @measures("Fine-tuning without a warm start outperforms")
 def _() -> Finding:
-    """By the mean success over all evaluations: at the end both may have lost everything."""
+    """By the mean success over evaluations at the same numbers of the *actor's* updates: while it waits, a warm start loses nothing."""
     _, curves = recorded("warm_finetuning")
-    plain, warm = efficiency(curves, "vanilla"), efficiency(curves, "warm-fixed")
+    arms = {}
+    for recipe, waits in (("vanilla", 0), ("warm-fixed", WARM_UPDATES)):
+        rows = evaluations(curves, recipe)
+        moved = rows[rows.updates > waits].assign(age=(rows.updates - waits) // 100)
+        arms[recipe] = moved.set_index(["task", "seed", "age"]).success_once
+    both = pd.concat(arms, axis=1, join="inner").groupby(["task", "seed"]).mean()
+    plain, warm = both["vanilla"], both["warm-fixed"]
+    told_apart(plain, warm)
     interval, values = difference(plain, warm)
-    return finding("warm_finetuning", values, f"mean success over all evaluations: without {percent(plain.mean())}, with a warm start and "
-                   f"a fixed temperature {percent(warm.mean())}: {100 * interval.value:+.1f} points", points(interval), judged(interval))
+    told = (f"mean success at equal numbers of the actor's updates: without {percent(plain.mean())}, with a warm start and a fixed "
+            f"temperature {percent(warm.mean())}: {100 * interval.value:+.1f} points")
+    return finding("warm_finetuning", values, told, points(interval), judged(interval))
 
 
 @measures("With a warm start and a fixed entropy coefficient, the training of the critic is very unstable")
@@ -226,7 +246,7 @@ def _() -> Finding:
     interval = mean_interval(ratio)
     low, high = np.exp([interval.low, interval.high])
     return finding("warm_start", ratio, f"largest mean |Q| {np.exp(interval.value):.1f} times the largest worth of rewards",
-                   f"{low:.1f} to {high:.1f} times (percentile bootstrap over seeds, 95 %)", judged(interval))
+                   f"{low:.1f} to {high:.1f} times ({METHOD})", judged(interval))
 
 
 # ---- the horizon (F.1, F.4; notebook 10) -------------------------------------------------------------------------------
@@ -234,16 +254,13 @@ def _() -> Finding:
 @measures("A long task horizon is a key factor")
 def _() -> Finding:
     """horizon_analysis.failure_verdict: fine-tuning ends below its base policy on the whole task, not where episodes start late."""
-    table, _ = recorded("horizon")
-    rows = by_fraction(table)
-    rows = rows[rows.method == "sac_finetune"]
-    ends = rows.start_fraction.min(), rows.start_fraction.max()
-    whole, short = (by_seed(rows[rows.start_fraction == end].assign(recipe="x"), "x", "gain") for end in ends)
-    verdict, _ = failure_verdict(rows)
+    rows = by_fraction(recorded("horizon")[0])
+    whole, short = end_gains(rows)
     interval, values = difference(short, whole)
-    told = "; ".join(f"start at {f:g}: gain {100 * part.gain.mean():+.1f} points" for f, part in rows.groupby("start_fraction"))
+    told = "; ".join(f"start at {f:g}: gain {100 * part.gain.mean():+.1f} points"
+                     for f, part in rows[rows.method == "sac_finetune"].groupby("start_fraction"))
     return finding("horizon", values, f"SAC fine-tuning over its base, by the share of the way that lies behind: {told}",
-                   f"latest less whole: {points(interval)}", verdict)
+                   f"latest less whole: {points(interval)}", failure_verdict(rows)[0])
 
 
 @measures("With a longer horizon, random exploration")
@@ -272,8 +289,7 @@ def _() -> Finding:
     ratio = np.log(by_seed(rows, "x", columns[max(columns)]) / by_seed(rows, "x", columns[min(columns)]))
     interval = mean_interval(ratio)
     grows = rows[[columns[length] for length in sorted(columns)]].diff(axis=1).iloc[:, 1:].gt(0).all(axis=None)
-    low, high = np.exp([interval.low, interval.high])
     told = ", ".join(f"{length} steps: {rows[name].mean():,.0f}" for length, name in sorted(columns.items()))
     return finding("exploration", ratio, f"updates until a corridor is valued right: {told}",
-                   f"longest against shortest {low:.1f} to {high:.1f} times (percentile bootstrap over seeds, 95 %)",
+                   f"longest against shortest {times(interval, 1)}",
                    judged(interval) if grows else "not" if interval.value <= 0 else "partly")

@@ -1,8 +1,8 @@
 """The decorator's parts (data/sweeps/ablations.toml, low_checkpoint.toml)."""
 from __future__ import annotations
 
-from ..ablations import GRID, VERDICTS, action_scales, alpha_works
-from ..claims import Finding, by_seed, compared, difference, finding, judged, percent, points, recorded
+from ..ablations import GRID, action_scales, alpha_works
+from ..claims import Finding, by_seed, compared, difference, finding, jointly, judged, percent, points, recorded, weakest
 from ..demos import sources
 from .registry import measures
 
@@ -42,7 +42,7 @@ def _() -> Finding:
     own, ends = by_seed(table, GRID, "decorated_success"), by_seed(table, wide, "decorated_success")
     interval, values = difference(ends, own)
     gain, _ = difference(ends, by_seed(table, wide, "base_success"))
-    verdict = min(judged(interval, -0.1), judged(gain), "partly", key=VERDICTS.index)
+    verdict = weakest(judged(interval, -0.1), judged(gain), "partly")
     return finding("ablations", values, f"H=40000 (all of the training) {percent(ends.mean())}, H=20000 {percent(own.mean())}: "
                    f"{100 * interval.value:+.1f} points; {100 * gain.value:+.1f} over the base policy", points(interval), verdict)
 
@@ -50,7 +50,7 @@ def _() -> Finding:
 @measures("alpha close to the scale of the demonstrated actions")
 def _() -> Finding:
     """The bound of the grid that is closest to the scale works (compare: pdkit/ablations.py). The paper does not say which scale: by the
-    size of an action and by that of a step, both must hold; one alone is partly."""
+    size of an action and by that of a step, both must hold."""
     table, _ = recorded("ablations")
     found = {name: (scale, *alpha_works(table, scale)) for name, scale in action_scales(sources.bundled("Door")).items()}
     known = {verdict for _, verdict, _, _ in found.values()}
@@ -58,7 +58,7 @@ def _() -> Finding:
     told = "; ".join(f"{name} {scale:.2f}: {near.split(',')[0]} {100 * behind.value:+.1f} points against the best bound ({verdict})"
                      for name, (scale, verdict, behind, near) in found.items())
     values = by_seed(table, next(near for *_, near in found.values()), "decorated_success")
-    return finding("ablations", values, told, f"the lower one: {points(interval)}", known.pop() if len(known) == 1 else "partly")
+    return finding("ablations", values, told, f"the lower one: {points(interval)}", jointly(*known))
 
 
 @measures("Policy Decorator substantially improves a low-performing BeT")
