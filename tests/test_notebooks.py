@@ -3,6 +3,7 @@ import os
 import re
 import subprocess
 import sys
+import tomllib
 
 import nbformat
 import pytest
@@ -11,6 +12,7 @@ from pdkit import check, main_job, nb, stats, unlearning
 from pdkit.errors import PdkitError
 from pdkit.files import DATA, ROOT, read_json
 from pdkit.main_job import configured, expected_minutes
+from pdkit.methods.registry import method_config
 
 NAMES = sorted(nb.notebooks())
 
@@ -36,6 +38,38 @@ def test_links_and_files_that_a_notebook_names_exist(name):
     text = "\n".join(cell.source for cell in cells if cell.cell_type == "markdown")
     for target in re.findall(r"\]\(([\w./-]+\.ipynb)\)", text):
         assert (nb.NOTEBOOKS / target).exists(), target
+
+
+BUDGETS = [  # notebook, sweep, what its prose says of the sweep's [fixed] (leaderboard's JSRL: of its cell)
+    ("08", "q_architectures", "{total_steps:,} steps, adapters"),
+    ("09", "calql", "{calql_offline_updates:,} offline updates (half of the table's)"),
+    ("09", "calql", "the budget is {total_steps:,} steps"),
+    ("09", "calql", "An evaluation has {eval_episodes} episodes a seed"),
+    ("11", "leaderboard", "`own_steps = {total_steps:_}`: your runs end where the recorded ones do"),
+    ("13", "ablations", "the dot the *last* policy, tested on {episodes};"),
+    ("13", "ablations", "H=0 total_steps={total_steps:_}"),
+    ("16", "leaderboard", "evaluations on {eval_episodes} episodes for each seed (JSRL: {jsrl_episodes})"),
+    ("16", "leaderboard", "a square is a test of {episodes}, a dot an evaluation on {eval_episodes} *selection* episodes"),
+    ("16", "leaderboard", "- {episodes} test episodes and {eval_episodes} selection episodes for each seed"),
+    ("16", "leaderboard", "(every {jsrl_every:,} steps, {jsrl_episodes} episodes"),
+]
+
+
+def test_budgets_in_prose_are_those_of_the_sweeps():
+    """The rest is printed from recorded tables. Prose that says "the same budget" needs sweeps that have it."""
+    fixed = {path.stem: tomllib.loads(path.read_text()) for path in (DATA / "sweeps").glob("*.toml")}
+    jsrl = next(cell for cell in fixed["leaderboard"]["cells"] if cell["recipe"] == "jsrl")
+    others = {"jsrl_every": jsrl["eval_every"], "jsrl_episodes": jsrl["eval_episodes"]}
+    for number, sweep, words in BUDGETS:
+        text = " ".join(" ".join(c.source for c in nbformat.read(nb.find_notebook(number), 4).cells if c.cell_type == "markdown").split())
+        said = words.format(**fixed[sweep]["fixed"] | others)
+        assert said in text, f"notebook {number} does not say {said!r}, which data/sweeps/{sweep}.toml asks for"
+    for name in ("total_steps", "episodes", "eval_every", "eval_episodes"):
+        assert len({fixed[sweep]["fixed"][name] for sweep in ("ablations", "recipe_steps", "low_checkpoint", "calql", "leaderboard")}) == 1
+    calql = next(cell for cell in fixed["leaderboard"]["cells"] if cell["recipe"] == "calql")["calql_offline_updates"]
+    usual = method_config("calql", "Door").method_config.calql_offline_updates
+    assert calql == fixed["calql"]["fixed"]["calql_offline_updates"] == usual / 2
+    assert {method_config(m, "Door").warmup_steps for m in ("policy_decorator", "residual_rl", "sac_finetune")} == {6_000}
 
 
 def test_start_here_runs_from_the_notebooks_folder(tmp_path):
