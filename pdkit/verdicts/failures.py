@@ -147,7 +147,7 @@ def _() -> Finding:
     return finding("q_architectures", values, told, f"the best one: {points(interval)}", judged(turned(interval)))
 
 
-# ---- notebooks with five seeds (unlearning, warm start) ----------------------------------------------------------------
+# ---- notebooks run with several seeds (unlearning, warm start) ----------------------------------------------------------------
 
 def _unlearning(task: str) -> pd.DataFrame:
     table, _ = recorded("unlearning")
