@@ -19,7 +19,7 @@ import numpy as np
 import pandas as pd
 import torch
 
-from .claims import LEAST_SEEDS, by_seed, mean_interval
+from .ablations import differences
 from .decorator import critic_features
 from .demos.sources import rollouts
 from .methods.config import CRITIC_BACKBONES
@@ -32,7 +32,6 @@ from .rl.ppo import clipped_surrogate, clipped_value_loss, log_prob
 from .rl.replay import Replay
 from .rl.sac import SAC
 from .seeds import rollout_seeds
-from .stats import Interval
 from .torch_setup import autocast
 from .unlearning import drift, updates
 
@@ -191,18 +190,8 @@ def moved_by_critics(drifts: Mapping[str, float]) -> tuple[str, list[str]]:
 # ---- recorded runs ---------------------------------------------------------------------------------------------------
 
 def gains(table: pd.DataFrame, methods: Sequence[str] = ("sac_finetune", "ppo_finetune")) -> pd.DataFrame:
-    """What each recorded architecture gains over the policy that it started from: recipe, method, kind, label, seeds, value, low, high
-    (NaN below three seeds), in the order of KINDS; those that are not recorded have no row."""
-    rows = []
-    for method in methods:
-        for kind, label in KINDS.items():
-            mine = table[table.recipe == recipe(method, kind)]
-            if mine.empty:
-                continue
-            gained = mine.decorated_success - mine.base_success
-            interval = Interval(gained.mean(), np.nan, np.nan)
-            if mine.seed.nunique() >= LEAST_SEEDS:
-                interval = mean_interval(by_seed(mine.assign(gain=gained), recipe(method, kind), "gain"))
-            rows.append({"recipe": recipe(method, kind), "method": method, "kind": kind, "seeds": mine.seed.nunique(),
-                         "label": f"{method.split('_')[0].upper()}, {label}", **vars(interval)})
-    return pd.DataFrame(rows, columns=["recipe", "method", "kind", "seeds", "label", "value", "low", "high"])
+    """`ablations.differences` of each recorded architecture from the policy that it started from, with columns method and kind, in the
+    order of KINDS."""
+    cells = {recipe(method, kind): (method, kind) for method in methods for kind in KINDS}
+    rows = differences(table, {name: f"{method.split('_')[0].upper()}, {KINDS[kind]}" for name, (method, kind) in cells.items()})
+    return rows.assign(method=[cells[name][0] for name in rows.recipe], kind=[cells[name][1] for name in rows.recipe])
