@@ -49,7 +49,7 @@ def summary(table: pd.DataFrame, column: str = "decorated_success", labels: dict
 def over_seeds(statistic: Callable[[np.ndarray], float], values: np.ndarray) -> Interval:
     """A statistic of runs (N,) with its bootstrap interval, which is NaN below three: one or two values would give one of no width."""
     if len(values) < LEAST_SEEDS:
-        return Interval(float(statistic(values)), np.nan, np.nan)
+        return Interval(float(statistic(values[:, None])), np.nan, np.nan)
     return stratified_bootstrap(statistic, values[:, None], seed=BOOTSTRAP_SEED, repetitions=500)
 
 

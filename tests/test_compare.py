@@ -120,6 +120,14 @@ def test_budgets_tell_what_is_not_equal():
     assert set(rows.updates) == {"8,500"} and rows.loc["Policy Decorator", "demonstrations"] == "25% of a batch"
 
 
+def test_figures_give_no_interval_below_three_seeds():
+    table = pd.concat([runs("one", [0.5]), runs("two", [0.2, 0.6]), runs("three", [0.1, 0.2, 0.6])])
+    rows = plots_compare.summary(table).set_index("recipe")
+    assert rows.low.isna().tolist() == rows.high.isna().tolist() == [True, True, False]
+    assert rows.iqm.tolist() == pytest.approx([0.5, 0.4, 0.3]) and rows.low["three"] < 0.3 < rows.high["three"]
+    assert plots_compare.finals_figure(table).png()[:4] == b"\x89PNG"
+
+
 # ---- one change at a time --------------------------------------------------------------------------------------------
 
 def test_differences_are_paired_by_seed():

@@ -147,7 +147,8 @@ def _() -> Finding:
 @measures("Fine-tuning baselines unlearn")
 def _() -> Finding:
     """Success of the first evaluation after learning began, against the start: a method unlearns when it falls by more than 10 points
-    (ours, because evaluations and start are measured on other episodes). reproduced: most methods do; partly: one does."""
+    (ours, because evaluations and start are measured on other episodes). reproduced: most methods do, of two or more recorded ones;
+    partly: one does."""
     table, curves = recorded("leaderboard")
     drops = {}
     for recipe in FINE_TUNING:
@@ -161,7 +162,7 @@ def _() -> Finding:
     told = ", ".join(f"{recipe} {100 * drop.value:+.1f}" for recipe, (drop, _) in drops.items())
     return finding("leaderboard", values, f"{len(fallen)} of {len(drops)} methods fall; points at the first evaluation against the start: "
                    f"{told}", f"{middle} (the middle one): {points(interval)}",
-                   "reproduced" if len(fallen) > len(drops) / 2 else "partly" if fallen else "not")
+                   "reproduced" if len(fallen) > max(1, len(drops) / 2) else "partly" if fallen else "not")
 
 
 @measures("Once unlearned, a policy is very hard to relearn")
