@@ -51,7 +51,9 @@ def lines(rows: pd.DataFrame) -> list[str]:
 
 
 def _by_seed(table: pd.DataFrame, recipe: str, column: str) -> pd.Series:
-    """As claims.by_seed, but with however few seeds there are."""
+    """As claims.by_seed, but with however few seeds there are, none included (an empty table has no such column)."""
+    if table.empty:
+        return pd.Series(dtype=float, index=pd.MultiIndex.from_arrays([[], []], names=["task", "seed"]))
     return table[table.recipe == recipe].set_index(["task", "seed"])[column].astype(float).dropna()
 
 

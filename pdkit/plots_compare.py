@@ -209,7 +209,7 @@ def matrix_figure(values: pd.DataFrame, *, title: str = "", xlabel: str = "", yl
     if values.empty:
         raise PdkitError("This figure needs at least one row and one column.")
     rows, columns = values.shape
-    figure, axes = blank(size=(2.6 + 0.62 * columns, 1.5 + 0.42 * rows))
+    figure, axes = blank(size=(max(5.6, 2.6 + 0.62 * columns), 1.5 + 0.42 * rows))
     ax, numbers = axes[0, 0], values.to_numpy(float)
     scale = mpl.colors.TwoSlopeNorm(middle, 0, 1) if middle is not None else mpl.colors.Normalize(0, 1)
     ax.imshow(numbers, cmap="RdBu" if middle is not None else "Blues", norm=scale, aspect="auto")
