@@ -8,7 +8,6 @@
 """
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -16,6 +15,7 @@ import numpy as np
 import pandas as pd
 import torch
 
+from . import unlearning
 from .compare import available
 from .decorator import critic_features
 from .demos import sources
@@ -139,13 +139,7 @@ def calibration_verdict(rows: pd.DataFrame, margin: float = 0.5) -> tuple[str, l
 def seconds(letter: str, online: str, count: int = 5, **changes: Any) -> float:
     """Median seconds of an update of a setup's networks with the online loss `online` ("sac" or "calql"), on its offline data."""
     trainer = trainer_of_setup(letter, calql_offline_updates=0, calql_online=online, calql_data="demos", **changes)
-    taken, generator = [], torch.Generator().manual_seed(0)
-    for _ in range(count + 2):  # the first two make the optimisers' memories
-        batch = trainer.demos.unpack(trainer.demos.draw(trainer.config.batch, generator))
-        started = time.perf_counter()
-        trainer.agent.update(batch, generator)
-        taken.append(time.perf_counter() - started)
-    return float(np.median(taken[2:]))
+    return unlearning.seconds(trainer.agent, trainer.demos, count, trainer.config.batch)
 
 
 # ---- recorded runs ---------------------------------------------------------------------------------------------------

@@ -9,28 +9,27 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from .claims import DECORATOR, LEAST_SEEDS
+from .claims import DECORATOR
 from .demos import sources
 from .errors import PdkitError
 from .methods import METHODS
 from .methods.registry import base_folder, get_method, method_config, trainer_of
-from .plots_compare import labelled
+from .plots_compare import labelled, over_seeds
 from .policies import load_policy
 from .policies.base import read_card
 from .profiles import flat
 from .recorded import load
 from .runs import Run, origin
-from .stats import Interval, iqm, probability_of_improvement, stratified_bootstrap
+from .stats import Interval, iqm, probability_of_improvement
 from .train import decorate
 
-BOOTSTRAP_SEED = 0  # a table computed twice is the same
 SCRATCH = "from scratch"
 FAMILIES = {  # how the methods are told apart in a figure: by what learns
     "a small network on a frozen policy": ("policy_decorator", "residual_rl", "jsrl", "fish"),
@@ -95,13 +94,6 @@ def scores(table: pd.DataFrame, recipe: str, column: str) -> np.ndarray:
 
 # ---- comparisons -----------------------------------------------------------------------------------------------------
 
-def _interval(statistic: Callable[..., float], *arrays: np.ndarray) -> Interval:
-    """The statistic of one or two (runs x tasks) arrays; its interval is NaN below three seeds."""
-    if min(map(len, arrays)) < LEAST_SEEDS:
-        return Interval(statistic(*arrays), np.nan, np.nan)
-    return stratified_bootstrap(statistic, *arrays, seed=BOOTSTRAP_SEED)
-
-
 def pairwise(table: pd.DataFrame, labels: Mapping[str, str] | None = None, column: str = "decorated_success") -> pd.DataFrame:
     """Probability that a run of the row's recipe ends above one of the column's; NaN on the diagonal."""
     names = labelled(table, labels)
@@ -121,13 +113,13 @@ def league(table: pd.DataFrame, labels: Mapping[str, str] | None = None, referen
     theirs = scores(table, reference, "decorated_success") if reference in set(table.recipe) else None
     for recipe, label in names.items():
         final, start = scores(table, recipe, "decorated_success"), scores(table, recipe, "base_success")
-        row = {"recipe": recipe, "label": label, "seeds": len(final), **vars(_interval(iqm, final)),
+        row = {"recipe": recipe, "label": label, "seeds": len(final), **vars(over_seeds(iqm, final)),
                "at_end": scores(table, recipe, "decorated_success_at_end").mean(), "minutes": scores(table, recipe, "train_minutes").mean()}
         row["iqm"] = row.pop("value")
         if not from_scratch(recipe):
-            row |= {"start": start.mean()} | _named("gain", _interval(np.mean, final - start))
+            row |= {"start": start.mean()} | _named("gain", over_seeds(np.mean, final - start))
         if theirs is not None and recipe != reference:
-            row |= _named("p", _interval(probability_of_improvement, final, theirs))
+            row |= _named("p", over_seeds(probability_of_improvement, final, theirs))
         rows.append(row)
     columns = ["recipe", "label", "seeds", "start", "iqm", "low", "high", "at_end", "gain", "gain_low", "gain_high", "p", "p_low", "p_high",
                "minutes"]
@@ -166,7 +158,7 @@ def smoothness(table: pd.DataFrame, labels: Mapping[str, str] | None = None) -> 
         row = {"recipe": recipe, "label": label, "seeds": len(success), "success": success.mean()}
         for name, column in (("jerk", "jerk"), ("change", "action_change")):
             ratio = scores(table, recipe, f"decorated_{column}") / scores(table, recipe, f"base_{column}")
-            logs = _interval(np.mean, np.log(np.maximum(ratio, LEAST_RATIO)))
+            logs = over_seeds(np.mean, np.log(np.maximum(ratio, LEAST_RATIO)))
             row |= {key: float(np.exp(value)) for key, value in _named(name, logs).items()}
         rows.append(row)
     return pd.DataFrame(rows)

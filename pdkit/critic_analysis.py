@@ -10,7 +10,6 @@ against returns with the actor at rest and without the entropy term; on a shared
 from __future__ import annotations
 
 import copy
-import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -33,7 +32,7 @@ from .rl.replay import Replay
 from .rl.sac import SAC
 from .seeds import rollout_seeds
 from .torch_setup import autocast
-from .unlearning import drift, updates
+from .unlearning import drift, seconds, updates
 
 KINDS = {"mlp": "MLP", "shared": "shared transformer", "separate": "separate transformer"}
 NEVER = 10**9  # updates to wait
@@ -136,14 +135,8 @@ def costs(agent: SAC, replay: Replay, count: int = 10, batch: int = 64) -> dict[
     seconds: the median time of an update with a step of the actor in it."""
     mine = list(agent.critics.parameters())
     actors = {id(p) for p in agent.actor.parameters()}
-    taken, generator = [], torch.Generator().manual_seed(0)
-    for _ in range(count + 2):  # the first two make the optimisers' memories
-        rows = replay.unpack(replay.draw(batch, generator))
-        started = time.perf_counter()
-        agent.update(rows, generator)
-        taken.append(time.perf_counter() - started)
     return {"parameters": sum(p.numel() for p in mine), "trained": sum(p.numel() for p in mine if p.requires_grad),
-            "own": sum(p.numel() for p in mine if id(p) not in actors), "seconds": float(np.median(taken[2:]))}
+            "own": sum(p.numel() for p in mine if id(p) not in actors), "seconds": seconds(agent, replay, count, batch)}
 
 
 # ---- PPO -------------------------------------------------------------------------------------------------------------

@@ -40,17 +40,24 @@ def summary(table: pd.DataFrame, column: str = "decorated_success", labels: dict
         values = table.loc[table.recipe == recipe, column].dropna().to_numpy()
         if not len(values):
             continue
-        interval = over_seeds(iqm, values)
+        interval = over_seeds(iqm, values[:, None])
         rows.append({"recipe": recipe, "label": label, "seeds": len(values), "mean": values.mean(), "iqm": interval.value,
                      "low": interval.low, "high": interval.high})
     return pd.DataFrame(rows)
 
 
-def over_seeds(statistic: Callable[[np.ndarray], float], values: np.ndarray) -> Interval:
-    """A statistic of runs (N,) with its bootstrap interval, which is NaN below three: one or two values would give one of no width."""
-    if len(values) < LEAST_SEEDS:
-        return Interval(float(statistic(values[:, None])), np.nan, np.nan)
-    return stratified_bootstrap(statistic, values[:, None], seed=BOOTSTRAP_SEED, repetitions=500)
+def nth(rows: pd.DataFrame) -> pd.api.typing.DataFrameGroupBy:
+    """Rows of one recipe's curves by their number within a seed: seeds are logged a few steps apart, so the n-th belongs to the n-th."""
+    rows = rows.sort_values("step")
+    return rows.assign(number=rows.groupby("seed").cumcount()).groupby("number")
+
+
+def over_seeds(statistic: Callable[..., float], *arrays: np.ndarray, repetitions: int = 2000) -> Interval:
+    """A statistic of one or two (runs x tasks) arrays with its bootstrap interval, which is NaN below three runs: one or two values would
+    give one of no width."""
+    if min(map(len, arrays)) < LEAST_SEEDS:
+        return Interval(float(statistic(*arrays)), np.nan, np.nan)
+    return stratified_bootstrap(statistic, *arrays, seed=BOOTSTRAP_SEED, repetitions=repetitions)
 
 
 @styled
@@ -71,10 +78,9 @@ def curves_figure(curves: pd.DataFrame, *, column: str = "success_once", labels:
     figure, axes = blank(size=(7.6, 4.4))
     ax = axes[0, 0]
     for recipe, label in names.items():
-        rows = curves[(curves.recipe == recipe) & curves[column].notna()].copy()
+        rows = curves[(curves.recipe == recipe) & curves[column].notna()]
         if len(rows):
-            rows["number"] = rows.groupby("seed").cumcount()  # seeds are logged a few steps apart: n-th belongs to n-th
-            by = rows.groupby("number")
+            by = nth(rows)
             step, values = by.step.mean(), by[column]
             ax.plot(step, values.mean(), "-o", ms=3.5, color=color[recipe], label=f"{label} ({rows.seed.nunique()})")
             ax.fill_between(step, values.min(), values.max(), color=color[recipe], alpha=0.13, lw=0)
@@ -83,7 +89,7 @@ def curves_figure(curves: pd.DataFrame, *, column: str = "success_once", labels:
     if base is not None:
         ax.axhline(base, color=COLORS["base"], ls="--", lw=1.3, label="base policy")
     ax.set(xlabel="environment steps", xlim=(0, None))
-    _steps(ax)
+    thousands(ax)
     _values(ax, "y", column, ylabel, log)
     ax.set_title(title)
     figure.legend(loc="outside right upper", fontsize=8.5, title="recipe (seeds)", title_fontsize=8.5)
@@ -124,9 +130,9 @@ def finals_figure(table: pd.DataFrame, *, column: str = "decorated_success", lab
     return figure
 
 
-def _steps(ax: Axes) -> None:
-    """The axis of environment steps."""
-    ax.xaxis.set_major_locator(mpl.ticker.MaxNLocator(5))
+def thousands(ax: Axes, most: int = 5, integer: bool = False) -> None:
+    """The axis of steps or updates: at most so many marks, with commas."""
+    ax.xaxis.set_major_locator(mpl.ticker.MaxNLocator(most, integer=integer))
     ax.xaxis.set_major_formatter(mpl.ticker.FuncFormatter(lambda x, _: f"{x:,.0f}"))
 
 
@@ -173,7 +179,7 @@ def panels_figure(curves: pd.DataFrame, panels: Mapping[str, Sequence[str]], *, 
         if base is not None:
             ax.axhline(base, color=COLORS["base"], ls="--", lw=1.2)
         _values(ax, "y", column, "", False)
-        _steps(ax)
+        thousands(ax)
         ax.set_title(family)
         ax.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.02), borderaxespad=0.2, handlelength=1.4)  # never over a curve
     for ax in axes.flat[count:]:
@@ -191,9 +197,9 @@ def _band(ax: Axes, curves: pd.DataFrame, recipe: str, column: str, color: str, 
     rows = curves[(curves.recipe == recipe) & curves[column].notna()].sort_values("step")
     if rows.empty:
         return
-    rows = rows.assign(number=rows.groupby("seed").cumcount())  # seeds are logged a few steps apart: n-th belongs to n-th
-    step = rows.groupby("number").step.mean()
-    limits = [over_seeds(np.mean, values.to_numpy()) for _, values in rows.groupby("number")[column]]
+    by = nth(rows)
+    step = by.step.mean()
+    limits = [over_seeds(np.mean, values.to_numpy()[:, None], repetitions=500) for _, values in by[column]]
     ax.plot(step, [i.value for i in limits], "-o", ms=3.5, color=color, label=f"{label} ({rows.seed.nunique()})")
     ax.fill_between(step, [i.low for i in limits], [i.high for i in limits], color=color, alpha=0.15, lw=0)
 

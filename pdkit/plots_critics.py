@@ -8,15 +8,10 @@ import numpy as np
 import pandas as pd
 
 from .plots import COLORS, Picture, _columns, _percent, blank, styled
-from .plots_compare import colours
+from .plots_compare import colours, thousands
 
 VALUES = {"data": "actions of the data", "policy": "the policy's actions", "random": "random actions"}
 SOURCES = {"demonstrations": COLORS["gained"], "rollouts": COLORS["lost"]}
-
-
-def _thousands(ax) -> None:
-    ax.xaxis.set_major_locator(mpl.ticker.MaxNLocator(5, integer=True))
-    ax.xaxis.set_major_formatter(mpl.ticker.FuncFormatter(lambda x, _: f"{x:,.0f}"))
 
 
 # ---- 08 --------------------------------------------------------------------------------------------------------------
@@ -33,7 +28,7 @@ def drifts_figure(rows: pd.DataFrame, labels: Mapping[str, str], title: str = ""
             ax.plot(mine["update"], mine.drift, "-o", ms=4 + 3 * (i == 0), mfc="white" if i == 0 else color[kind], color=color[kind],
                     label=label)  # the first as open circles, seen below another line that lies on it
         ax.set(xlabel="updates", xlim=(0, None), ylim=(min(0.0, -0.03 * rows[rows.stage == stage].drift.max()), None))
-        _thousands(ax)
+        thousands(ax, integer=True)
         ax.set_title(stage)
     axes[0, 0].set_ylabel("mean |a - a0| per joint")
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=len(labels), fontsize=9)
@@ -55,7 +50,7 @@ def values_figure(rows: pd.DataFrame, scatter: Mapping[str, np.ndarray], returns
     ax.axhline(spread, color=COLORS["base"], ls=":", lw=1.4)
     ax.annotate("the best constant", (0, spread), (4, 4), textcoords="offset points", color=COLORS["base"], fontsize=8.5)
     ax.set(xlabel="updates", ylabel="error of Q (reward)", xlim=(0, None), ylim=(0, None))
-    _thousands(ax)
+    thousands(ax, integer=True)
     ax.set_title("Error against returns")
     low = min(float(returns.min()), *(float(v.min()) for v in scatter.values()))
     high = max(float(returns.max()), *(float(v.max()) for v in scatter.values()))
@@ -88,8 +83,7 @@ def costs_figure(rows: pd.DataFrame, labels: Mapping[str, str]) -> Picture:
     left.set_yticks(y, list(labels.values()))
     left.set(xlim=(0, 1.25 * rows.parameters.max()), ylim=(len(labels) - 0.4, -0.6))
     right.set_xlim(0, 1200 * rows.seconds.max())
-    left.xaxis.set_major_locator(mpl.ticker.MaxNLocator(4))
-    left.xaxis.set_major_formatter(mpl.ticker.FuncFormatter(lambda x, _: f"{x:,.0f}"))
+    thousands(left, 4)
     for ax, name in ((left, "Parameters of the critics"), (right, "Milliseconds an update")):
         ax.grid(axis="y", visible=False)
         ax.set_title(name)
@@ -131,7 +125,7 @@ def calibration_figure(rows: pd.DataFrame, returns: float) -> Picture:
             ax.plot(mine["update"], mine[name], "-o", ms=3, color=tones[name], label=label)
         ax.axhline(returns, color="black", ls="--", lw=1.1, label="mean return of the data")
         ax.set(xlabel="offline updates", xlim=(0, None))
-        _thousands(ax)
+        thousands(ax, integer=True)
         ax.set_title(loss)
     axes[0, 0].set_ylabel("mean Q")
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=9)
@@ -154,7 +148,7 @@ def offline_figure(curves: pd.DataFrame, labels: Mapping[str, str], own: pd.Data
             if own is not None and len(mine := own[(own.recipe == recipe) & (own.step == 0)]):
                 ax.plot(mine.updates, mine[column], ":o", ms=4, mfc="white", color=color[recipe], label=f"{label}, your run")
         ax.set(xlabel="offline updates", xlim=(0, None))
-        _thousands(ax)
+        thousands(ax, integer=True)
         ax.set_title(name)
     _percent(axes[0, 2], "share of values")
     handles, names = axes[0, 0].get_legend_handles_labels()

@@ -103,7 +103,7 @@ def sweep_figure(table: pd.DataFrame, column: str, labels: dict[str, str], *, ow
             ax.plot(1 - fraction + shift + 0.004 * np.arange(len(lost)), [budget] * len(lost), "^", ms=7, mfc="white", color=color)
         groups = [(f, part[column]) for f, part in known.groupby("start_fraction")]
         for fraction, values in groups:
-            interval = over_seeds(np.mean, values.to_numpy())
+            interval = over_seeds(np.mean, values.to_numpy()[:, None], repetitions=500)
             ax.plot([1 - fraction + shift] * 2, [interval.low, interval.high], color=color, lw=2.2)
         ax.plot([1 - f + shift for f, _ in groups], [v.mean() for _, v in groups], "-o", ms=6, color=color, label=name)
     if own is not None:

@@ -9,7 +9,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 
 from .plots import COLORS, Picture, _columns, _percent, blank, styled
-from .plots_compare import PALETTE, colours, labelled
+from .plots_compare import PALETTE, colours, labelled, nth, thousands
 from .stats import Rate
 
 
@@ -75,8 +75,7 @@ def sizes_figure(curves: pd.DataFrame, labels: dict[str, str], *, own: pd.DataFr
                     ax.plot(mine.step, mine[column], ":", color=color[recipe], lw=1.3, **marks,
                             label=f"{name}, your run" if column == "residual_size" else None)
         ax.set(xlabel="environment steps", xlim=(0, None))
-        ax.xaxis.set_major_locator(mpl.ticker.MaxNLocator(4))
-        ax.xaxis.set_major_formatter(mpl.ticker.FuncFormatter(lambda x, _: f"{x:,.0f}"))
+        thousands(ax, 4)
     axes[0, 0].set(ylabel="mean size per action dimension", ylim=(0, None))
     for style, name in (("-", "residual"), ("--", "base action")):
         axes[0, 0].plot([], [], style, color="0.3", label=name)
@@ -89,11 +88,10 @@ def sizes_figure(curves: pd.DataFrame, labels: dict[str, str], *, own: pd.DataFr
 
 def _mean(ax: Axes, rows: pd.DataFrame, column: str, style: str, color: str, name: str) -> None:
     """The mean over seeds in its band."""
-    rows = rows[rows[column].notna()].sort_values("step") if column in rows else rows[:0]
+    rows = rows[rows[column].notna()] if column in rows else rows[:0]
     if rows.empty:
         return
-    rows = rows.assign(number=rows.groupby("seed").cumcount())  # seeds are logged a few steps apart: n-th belongs to n-th
-    by = rows.groupby("number")
+    by = nth(rows)
     ax.plot(by.step.mean(), by[column].mean(), style, color=color,
             label=f"{name} ({rows.seed.nunique()} seeds)" if column == "residual_size" else None)
     ax.fill_between(by.step.mean(), by[column].min(), by[column].max(), color=color, alpha=0.13, lw=0)

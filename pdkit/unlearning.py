@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import copy
 import math
+import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any
@@ -75,6 +76,17 @@ def updates(agent: SAC, replay: Replay, count: int, *, batch: int = 64, seed: in
         rows = replay.draw(batch, generator)
         log = agent.update(replay.unpack(rows), generator, critics=critics)
         yield {"update": agent.updates, "gap": agent.target_entropy - float(log["entropy"]), **{k: float(v) for k, v in log.items()}}
+
+
+def seconds(agent: SAC, replay: Replay, count: int, batch: int) -> float:
+    """Median seconds of an update on batches of `replay`."""
+    taken, generator = [], torch.Generator().manual_seed(0)
+    for _ in range(count + 2):  # the first two make the optimisers' memories
+        rows = replay.unpack(replay.draw(batch, generator))
+        started = time.perf_counter()
+        agent.update(rows, generator)
+        taken.append(time.perf_counter() - started)
+    return float(np.median(taken[2:]))
 
 
 # ---- measurements ----------------------------------------------------------------------------------------------------

@@ -29,3 +29,13 @@ def _results_elsewhere(tmp_path_factory):
         del os.environ["PDKIT_RUNS"]
     else:
         os.environ["PDKIT_RUNS"] = before
+
+
+@pytest.fixture
+def results(tmp_path, monkeypatch):
+    """An empty data/results in a temporary folder, from which recorded results are then read."""
+    from pdkit import recorded
+
+    monkeypatch.setattr(recorded, "DATA", tmp_path)
+    (tmp_path / "results").mkdir()
+    return tmp_path / "results"

@@ -6,13 +6,6 @@ from pdkit import recorded
 from pdkit.errors import PdkitError
 
 
-@pytest.fixture
-def results(tmp_path, monkeypatch):
-    monkeypatch.setattr(recorded, "DATA", tmp_path)
-    (tmp_path / "results").mkdir()
-    return tmp_path / "results"
-
-
 def test_rows_and_curves_of_one_task_are_loaded(results):
     rows = pd.DataFrame({"task": ["Door", "Door", "Pen"], "recipe": "a", "seed": [0, 1, 0], "decorated_success": [0.5, 0.7, 0.1]})
     rows.to_csv(results / "x.csv", index=False)

@@ -3,7 +3,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from pdkit import check, plots_residual, recorded, report, stats, verdicts
+from pdkit import check, plots_residual, report, stats, verdicts
 from pdkit import residual_analysis as analysis
 from pdkit.decorator import DecoratorConfig
 from pdkit.demos import sources
@@ -169,13 +169,6 @@ def test_transport_of_whole_episodes_and_what_it_tells():
 
 
 # ---- verdicts over recorded runs -------------------------------------------------------------------------------------
-
-@pytest.fixture
-def results(tmp_path, monkeypatch):
-    monkeypatch.setattr(recorded, "DATA", tmp_path)
-    (tmp_path / "results").mkdir()
-    return tmp_path / "results"
-
 
 def verdict_of(start):
     found = verdicts.find(CLAIMS.claim[CLAIMS.claim.str.startswith(start)].item())

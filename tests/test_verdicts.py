@@ -3,18 +3,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from pdkit import ablations, claims, recorded, report, sweep, verdicts
+from pdkit import ablations, claims, report, sweep, verdicts
 from pdkit.files import DATA
 from pdkit.stats import Interval
 
 CLAIMS = report.load_claims(DATA / "results" / "claims.csv")
-
-
-@pytest.fixture
-def results(tmp_path, monkeypatch):
-    monkeypatch.setattr(recorded, "DATA", tmp_path)
-    (tmp_path / "results").mkdir()
-    return tmp_path / "results"
 
 
 def runs(recipe, ends, *, task="Door", base=0.5, **columns):

@@ -244,9 +244,8 @@ def _() -> Finding:
     rows = table.assign(recipe="x", task="Door")
     ratio = np.log(by_seed(rows, "x", "runs.fixed.q") / by_seed(rows, "x", "rewards_alone"))
     interval = mean_interval(ratio)
-    low, high = np.exp([interval.low, interval.high])
     return finding("warm_start", ratio, f"largest mean |Q| {np.exp(interval.value):.1f} times the largest worth of rewards",
-                   f"{low:.1f} to {high:.1f} times ({METHOD})", judged(interval))
+                   times(interval, 1), judged(interval))
 
 
 # ---- the horizon (F.1, F.4; notebook 10) -------------------------------------------------------------------------------
@@ -263,17 +262,22 @@ def _() -> Finding:
                    f"latest less whole: {points(interval)}", failure_verdict(rows)[0])
 
 
+def _numbered(prefix: str) -> tuple[pd.DataFrame, dict[float, str]]:
+    """The exploration record, and its columns PREFIX.NUMBER by number, in order. Raises TooLittle below two of them."""
+    table, _ = recorded("exploration")
+    columns = {float(name.removeprefix(prefix)): name for name in table if name.startswith(prefix)}
+    if len(columns) < 2:
+        raise TooLittle(f"Fewer than two columns {prefix}NUMBER are recorded.")
+    return table.assign(recipe="x", task="Door"), dict(sorted(columns.items()))
+
+
 @measures("With a longer horizon, random exploration")
 def _() -> Finding:
     """Share of episodes with a reward under random actions: higher from the latest start than on the whole task."""
-    table, _ = recorded("exploration")
-    rows = table.assign(recipe="x", task="Door")
-    rates = {float(name.removeprefix("met.random actions.")): name for name in rows if name.startswith("met.random actions.")}
-    if len(rates) < 2:
-        raise TooLittle("Fewer than two horizons are recorded.")
+    rows, rates = _numbered("met.random actions.")
     whole, late = (by_seed(rows, "x", rates[end]) for end in (min(rates), max(rates)))
     interval, values = difference(late, whole)
-    told = ", ".join(f"{f:g}: {percent(rows[name].mean())}" for f, name in sorted(rates.items()))
+    told = ", ".join(f"{f:g}: {percent(rows[name].mean())}" for f, name in rates.items())
     return finding("exploration", values, f"episodes with a reward under random actions, by the share of the way that lies behind: {told}",
                    f"latest less whole: {points(interval)}", judged(interval))
 
@@ -281,15 +285,11 @@ def _() -> Finding:
 @measures("With a longer horizon, the sparse reward takes longer")
 def _() -> Finding:
     """Updates (1-step returns) until a corridor is valued right: more for each longer corridor, in every seed."""
-    table, _ = recorded("exploration")
-    rows = table.assign(recipe="x", task="Door")
-    columns = {int(name.removeprefix("updates.1-step.")): name for name in rows if name.startswith("updates.1-step.")}
-    if len(columns) < 2:
-        raise TooLittle("Fewer than two corridors are recorded.")
+    rows, columns = _numbered("updates.1-step.")
     ratio = np.log(by_seed(rows, "x", columns[max(columns)]) / by_seed(rows, "x", columns[min(columns)]))
     interval = mean_interval(ratio)
-    grows = rows[[columns[length] for length in sorted(columns)]].diff(axis=1).iloc[:, 1:].gt(0).all(axis=None)
-    told = ", ".join(f"{length} steps: {rows[name].mean():,.0f}" for length, name in sorted(columns.items()))
+    grows = rows[list(columns.values())].diff(axis=1).iloc[:, 1:].gt(0).all(axis=None)
+    told = ", ".join(f"{length:g} steps: {rows[name].mean():,.0f}" for length, name in columns.items())
     return finding("exploration", ratio, f"updates until a corridor is valued right: {told}",
                    f"longest against shortest {times(interval, 1)}",
                    judged(interval) if grows else "not" if interval.value <= 0 else "partly")
