@@ -29,6 +29,19 @@ def test_the_rule_of_a_comparison():
     assert claims.judged(Interval(0.2, 0.1, 0.3), 0.15) == "partly" and claims.judged(Interval(0.2, 0.1, 0.3), 0.25) == "not"
 
 
+def test_students_t_covers_the_truth_where_a_bootstrap_of_few_seeds_does_not():
+    """What pdkit/claims.py and notebook 16 say of intervals of three and five seeds, on normal draws whose mean is 0."""
+    rng = np.random.default_rng(0)
+    for seeds, bootstrap in ((3, 0.75), (5, 0.85)):
+        runs_of = rng.standard_normal((2_000, seeds))
+        means = rng.choice(np.arange(seeds), (400, seeds))  # the same redraws for all: 400 of them
+        low, high = np.quantile(runs_of[:, means].mean(axis=2), [0.025, 0.975], axis=1)
+        assert ((low < 0) & (high > 0)).mean() == pytest.approx(bootstrap, abs=0.04)
+        index = pd.MultiIndex.from_product([["Door"], range(seeds)], names=["task", "seed"])
+        found = [claims.mean_interval(pd.Series(values, index)) for values in runs_of]
+        assert np.mean([i.low < 0 < i.high for i in found]) == pytest.approx(0.95, abs=0.02)
+
+
 def test_differences_are_taken_seed_by_seed():
     """Seeds differ much, the pairs hardly: unpaired, this interval would reach over zero."""
     table = pd.concat([runs("a", [0.1, 0.5, 0.9, 0.3]), runs("b", [0.05, 0.46, 0.84, 0.26]).iloc[::-1]])

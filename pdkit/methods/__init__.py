@@ -25,8 +25,8 @@ class Method:
 # No base action is added and nothing is gated; acting is the actor's own business from the first step.
 _OWN_POLICY = dict(alpha=1.0, alpha_scale=(), H=0, residual_penalty=0.0)
 
-# A transformer as the actor: at batch 256 an update costs a core 0.1 to 0.4 s, ten times a residual's or more, and a lesson would take
-# an hour. At batch 64 it costs 0.03 s, still four times as much; half as many fit into the time of a decorator's run.
+# A transformer as the actor: an update costs several times a residual's, and a lesson would take an hour. Smaller batches, and half as
+# many updates a step, bring it near a decorator's run (data/results/leaderboard.csv: updates, train_minutes).
 _TRANSFORMER = dict(batch=64, utd=0.125)
 
 # PPO learns from its own policy alone, with the learning rate falling from the start (as in cleanrl) and a spread that starts at 0.6
