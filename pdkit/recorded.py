@@ -100,8 +100,10 @@ def figure(table: pd.DataFrame, curves: pd.DataFrame, task: str = "Door") -> Fig
     height = max(4.4 if several else 3.6, 0.22 * (len(recipes) if means else len(table)))
     fig, (left, right) = plt.subplots(1, 2, figsize=(10, height), width_ratios=(3, 2), layout="constrained")
     colors = plt.get_cmap("tab20" if several else "tab10")
-    base = table.base_success.iloc[0]  # the first row's; a recipe with another base policy is named so
-    bars = [("base", [base], "0.65")]
+    # The first row's of each kind of policy; a recipe with another base policy of the same kind is named so.
+    kinds = table.drop_duplicates("policy") if "policy" in table else table.iloc[:1]
+    bases = {f"base ({row.policy})" if len(kinds) > 1 else "base": row.base_success for row in kinds.itertuples()}
+    bars = [(name, [value], "0.65") for name, value in bases.items()]
     groups = [(r, r, table[table.recipe == r]) for r in recipes] if means else \
         [(f"{r.recipe}, seed {r.seed}" if several else f"seed {r.seed}", r.recipe, table.loc[[i]]) for i, r in table.iterrows()]
     for i, (name, recipe, rows) in enumerate(groups):
@@ -111,7 +113,8 @@ def figure(table: pd.DataFrame, curves: pd.DataFrame, task: str = "Door") -> Fig
         curve = curve.assign(number=curve.groupby("seed").cumcount()).groupby("number")[["step", "success_once"]].mean()
         left.plot(curve.step / 1000, 100 * curve.success_once, "-o", ms=3, lw=1.2, color=color, label=name)
         bars.append((name, list(rows.decorated_success), color if several else "#2c9f6b"))
-    left.axhline(100 * base, color="0.4", ls="--", lw=1, label="base policy")
+    for value in bases.values():
+        left.axhline(100 * value, color="0.4", ls="--", lw=1, label="base policy")
     left.set(xlabel="environment steps (thousands)", ylabel="success within the episode (%)", ylim=(0, 102),
              title=f"{task}: evaluations during training")
     if not several:
@@ -120,7 +123,7 @@ def figure(table: pd.DataFrame, curves: pd.DataFrame, task: str = "Door") -> Fig
     for y, (name, values, color) in enumerate(reversed(bars)):
         value = sum(values) / len(values)
         right.barh(y, 100 * value, color=color)
-        if means and name != "base":
+        if means and name not in bases:
             right.plot([100 * v for v in values], [y] * len(values), "k.", ms=4)
         else:
             rate = wilson(round(value * count), count)

@@ -32,3 +32,18 @@ def test_a_notebooks_columns_become_rows_by_arm():
                                        {"recipe": "before", "seed": 1, "success": 0.8}]
     with pytest.raises(PdkitError, match="no columns drift.ARM.value"):
         recorded.by_arm(table, "drift", "value", "drift")
+
+
+def test_the_picture_shows_every_policy_that_methods_start_from():
+    """A comparison of methods has several: the first row's alone would stand for all."""
+    rows = pd.DataFrame({"task": "Door", "recipe": ["a", "a", "b", "b"], "policy": ["bet", "bet", "vinn", "vinn"], "seed": [0, 1, 0, 1],
+                         "episodes": 60, "base_success": [0.5, 0.5, 0.9, 0.9], "decorated_success": [0.7, 0.8, 0.1, 0.2]})
+    curves = rows[["task", "recipe", "seed"]].assign(step=1_000, success_once=0.6)
+    for table, expected in ((rows, {"base (bet)": 0.5, "base (vinn)": 0.9, "a": 0.75, "b": 0.15}),
+                            (rows[rows.recipe == "a"].assign(recipe=["x", "y"]), {"base": 0.5})):
+        left, right = recorded.figure(table, curves[curves.recipe.isin(table.recipe)]).axes
+        names = [label.get_text() for label in right.get_yticklabels()]
+        widths = {names[round(bar.get_y() + bar.get_height() / 2)]: bar.get_width() / 100 for bar in right.patches}
+        assert {name: widths[name] for name in expected} == pytest.approx(expected)
+        dashes = sorted(line.get_ydata()[0] / 100 for line in left.lines if line.get_linestyle() == "--")
+        assert dashes == sorted(value for name, value in expected.items() if name.startswith("base"))
