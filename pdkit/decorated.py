@@ -18,6 +18,11 @@ from .rl.networks import Actor
 FORMAT = "pdkit-decorated-1"
 
 
+def flat_actions(base: Policy, windows: np.ndarray) -> np.ndarray:
+    """What `base` decides on for windows (N, window, obs_dim): (N, chunk * act_dim), the actions of a chunk one after the other."""
+    return base.act(windows).reshape(len(windows), -1)
+
+
 class Decorated:
     """Acts with a_base + alpha * tanh(mean residual): no gate, no sampling (facts.md 1.1, evaluation)."""
 
@@ -32,17 +37,17 @@ class Decorated:
 
     @torch.inference_mode()
     def parts(self, windows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Base actions and unscaled residuals, each (N, act_dim), for windows (N, window, obs_dim)."""
-        base = self.base.act(windows)[:, 0]
+        """Base actions and unscaled residuals, each (N, chunk * act_dim), for windows (N, window, obs_dim)."""
+        base = flat_actions(self.base, windows)
         device = next(self.actor.parameters()).device
         obs = torch.from_numpy(np.ascontiguousarray(windows[:, -1], np.float32)).to(device)
         features = actor_features(self.config, self.base.normalizer(obs) if self.normalize else obs, torch.from_numpy(base).to(device))
         return base, self.actor.mean_action(features).cpu().numpy()
 
     def act(self, windows: np.ndarray) -> np.ndarray:
-        """Action chunks (N, 1, act_dim) for windows (N, window, obs_dim); the environment clips them."""
+        """Action chunks (N, chunk, act_dim) for windows (N, window, obs_dim); the environment clips them."""
         base, residual = self.parts(windows)
-        return compose(self.config, base, residual)[:, None]
+        return compose(self.config, base, residual).reshape(len(base), self.chunk, -1)
 
 
 def save_decorated(policy: Decorated, folder: str | Path, info: dict[str, Any] | None = None) -> None:

@@ -41,12 +41,13 @@ def evaluate(spec: TaskSpec, actor: Actor, seeds: Sequence[int], *, window: int 
     num_envs = min(num_envs, len(queue))
     rows: dict[int, dict] = {}
     elapsed = np.zeros(num_envs, np.int64)
-    with VectorEnv(spec, num_envs, lambda lane: queue.pop() if queue else IDLE, window=window, chunk=chunk, workers=workers,
+    # Long enough to see every step of a chunk, for the measures of motion; the actor sees its own window of it.
+    with VectorEnv(spec, num_envs, lambda lane: queue.pop() if queue else IDLE, window=max(window, chunk), chunk=chunk, workers=workers,
                    max_episode_steps=max_episode_steps) as envs:
         windows = envs.reset()
         motions = Motions(spec, windows)
         while len(rows) < len(seeds):
-            actions = ask(actor, windows, elapsed)
+            actions = ask(actor, windows[:, -window:], elapsed)
             result = envs.step(actions)
             motions.add(actions, result.steps, result.final_windows)
             windows, elapsed = result.windows, np.where(result.done, 0, elapsed + result.steps)

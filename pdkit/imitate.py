@@ -2,15 +2,17 @@
 best success over 50-episode evaluations)."""
 from __future__ import annotations
 
+import contextlib
+import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 
 from .demos.format import Demos
-from .errors import PdkitError
+from .errors import PdkitError, unknown
 from .evaluate import evaluate
 from .policies import POLICIES, Policy
 from .seeds import selection_seeds
@@ -18,15 +20,21 @@ from .tasks import get_task
 from .tasks.spec import TaskSpec
 from .torch_setup import autocast
 
+SCHEDULES = ("constant", "cosine")
+
 
 @dataclass(frozen=True)
 class ImitateConfig:
-    """How a base policy is trained."""
+    """How a base policy is trained; a policy may train with other values of its own (`Policy.training`)."""
 
     iterations: int = 1500  # gradient steps
     batch: int = 256  # windows per step
-    lr: float = 1e-3  # AdamW, constant
-    weight_decay: float = 2e-4  # on the GPT's linear weights
+    lr: float = 1e-3  # AdamW
+    schedule: str = "constant"  # of the learning rate; "cosine" falls to 0 at the end
+    lr_warmup: int = 0  # gradient steps over which the learning rate rises from 0
+    beta1: float = 0.9  # AdamW's memory of gradients
+    weight_decay: float = 2e-4  # on the weights that the policy names (BeT: the GPT's linear ones)
+    ema_power: float = 0.0  # above 0 the averaged weights are evaluated and kept; the average remembers ever longer, 1 - (1 + step)^-power
     pad_start: bool = True  # windows before step 0 repeat the first observation, as acting does; the paper's code skips them
     eval_every: int = 500  # gradient steps between checkpoints
     eval_episodes: int = 50  # per checkpoint, on selection seeds; 0 keeps the last
@@ -36,28 +44,45 @@ class ImitateConfig:
     def __post_init__(self):
         if self.iterations < 1 or self.batch < 1 or self.eval_every < 1 or self.eval_episodes < 0 or self.lr <= 0 or self.seed < 0:
             raise PdkitError("Imitation needs iterations, batch and eval_every >= 1, eval_episodes and seed >= 0 and lr > 0.")
+        if self.schedule not in SCHEDULES:
+            raise unknown("schedule", self.schedule, SCHEDULES)
+        if self.lr_warmup < 0 or not 0 <= self.beta1 < 1 or self.ema_power < 0:
+            raise PdkitError("Imitation needs lr_warmup and ema_power of 0 or more, and beta1 in [0, 1).")
+
+    def lr_factor(self, iteration: int) -> float:
+        """What `lr` is multiplied by at gradient step `iteration`, from 0."""
+        if iteration < self.lr_warmup:
+            return iteration / self.lr_warmup
+        if self.schedule == "constant":
+            return 1.0
+        return 0.5 * (1 + math.cos(math.pi * (iteration - self.lr_warmup) / max(1, self.iterations - self.lr_warmup)))
 
 
 class Windows:
-    """All training windows of a demonstration set: (window, obs_dim) observations with the action taken at each position."""
+    """All training windows of a demonstration set: (window, obs_dim) observations, and `horizon` actions from the first of them on.
 
-    def __init__(self, demos: Demos, window: int, pad_start: bool):
+    Without `horizon` these are the actions taken at each position. Where a horizon reaches beyond a demonstration, `rest` says from
+    the last action what follows.
+    """
+
+    def __init__(self, demos: Demos, window: int, pad_start: bool, horizon: int = 0, rest: Callable[[np.ndarray], np.ndarray] = np.copy):
         observations, actions, index, offset = [], [], [], 0
+        beyond = max(0, horizon - window)
         for episode in demos.episodes():
             o, a = episode["observations"][:-1], episode["actions"]
             pad = window - 1 if pad_start else 0
             # Before the first step the first observation repeats; the action there is the first one's.
             o, a = (np.concatenate([np.repeat(x[:1], pad, axis=0), x]) for x in (o, a))
             index.extend(offset + np.arange(max(0, len(a) - window + 1)))
-            offset += len(a)
-            observations.append(o)
-            actions.append(a)
+            offset += len(a) + beyond
+            observations += [o, np.repeat(o[-1:], beyond, axis=0)]
+            actions += [a, np.repeat(rest(a[-1])[None], beyond, axis=0)]
         if not index:
             raise PdkitError(f"Every demonstration is shorter than the window of {window}; use a smaller window or pad_start=True.")
         self.observations = torch.from_numpy(np.concatenate(observations))
         self.actions = torch.from_numpy(np.concatenate(actions))
         self.index = torch.tensor(np.array(index))
-        self.span = torch.arange(window)
+        self.span, self.ahead = torch.arange(window), torch.arange(horizon or window)
 
     def all(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Every window (N, window, obs_dim), and the action (N, act_dim) taken at its last observation."""
@@ -65,10 +90,33 @@ class Windows:
         return self.observations[rows], self.actions[rows[:, -1]]
 
     def sample(self, batch: int, generator: torch.Generator) -> tuple[torch.Tensor, torch.Tensor]:
-        """(B, window, obs_dim) and (B, window, act_dim)."""
-        start = self.index[torch.randint(len(self.index), (batch,), generator=generator)]
-        rows = start[:, None] + self.span
-        return self.observations[rows], self.actions[rows]
+        """(B, window, obs_dim) and (B, horizon, act_dim)."""
+        start = self.index[torch.randint(len(self.index), (batch,), generator=generator)][:, None]
+        return self.observations[start + self.span], self.actions[start + self.ahead]
+
+
+class Average:
+    """The exponentially averaged weights of a policy in training (diffusers' EMAModel, whose decay rises with the steps)."""
+
+    def __init__(self, policy: Policy, power: float):
+        from diffusers.training_utils import EMAModel
+
+        self._parameters = list(policy.parameters())
+        self._ema = EMAModel(self._parameters, use_ema_warmup=True, power=power)
+
+    def step(self) -> None:
+        """Take in the weights as they are after a gradient step."""
+        self._ema.step(self._parameters)
+
+    @contextlib.contextmanager
+    def in_place(self) -> Iterator[None]:
+        """Within this block the policy has the averaged weights."""
+        self._ema.store(self._parameters)
+        self._ema.copy_to(self._parameters)
+        try:
+            yield
+        finally:
+            self._ema.restore(self._parameters)
 
 
 def imitate(kind: str, demos: Demos, config: ImitateConfig | None = None, policy_config: dict | None = None, *, device: str = "cpu",
@@ -79,14 +127,14 @@ def imitate(kind: str, demos: Demos, config: ImitateConfig | None = None, policy
     evaluated, success_once and success_at_end on the selection seeds. A policy without gradient steps, such as VINN, is only
     given the demonstrations: it has a single row, of iteration 0, and of `config` only the evaluation and the windows matter.
     """
-    config = config or ImitateConfig()
+    config = config or ImitateConfig(**POLICIES[kind].training)
     spec = get_task(demos.task)
     torch.manual_seed(config.seed)
     generator = torch.Generator().manual_seed(config.seed)
     policy = POLICIES[kind]({"obs_dim": spec.obs_dim, "act_dim": spec.act_dim, **POLICIES[kind].for_task(spec), **(policy_config or {})})
     policy.fit_statistics(demos.observations, demos.actions, config.seed)
     policy.to(device).train()
-    windows = Windows(demos, policy.window, config.pad_start)
+    windows = Windows(demos, policy.window, config.pad_start, policy.horizon, spec.resting)
     if not policy.learns:
         started = time.monotonic()
         policy.remember(*windows.all())
@@ -94,7 +142,9 @@ def imitate(kind: str, demos: Demos, config: ImitateConfig | None = None, policy
         if progress:
             progress(row)
         return policy.eval(), [row]
-    optimizer = torch.optim.AdamW(policy.parameter_groups(config.weight_decay), lr=config.lr, fused=True)
+    optimizer = torch.optim.AdamW(policy.parameter_groups(config.weight_decay), lr=config.lr, betas=(config.beta1, 0.999), fused=True)
+    rates = torch.optim.lr_scheduler.LambdaLR(optimizer, config.lr_factor)
+    average = Average(policy, config.ema_power) if config.ema_power else None
     history, best, best_state, started = [], -1.0, None, time.monotonic()
     for iteration in range(1, config.iterations + 1):
         observations, actions = (x.to(device) for x in windows.sample(config.batch, generator))
@@ -103,18 +153,22 @@ def imitate(kind: str, demos: Demos, config: ImitateConfig | None = None, policy
         optimizer.zero_grad(set_to_none=True)
         terms["loss"].backward()
         optimizer.step()
+        rates.step()
+        if average:
+            average.step()
         if iteration % config.eval_every and iteration < config.iterations:
             continue
         row = {"iteration": iteration, "seconds": time.monotonic() - started, **{k: float(v.detach()) for k, v in terms.items()}}
         if not np.isfinite(row["loss"]):
             raise PdkitError(f"The imitation loss became {row['loss']} at iteration {iteration}; lower lr (now {config.lr}).")
         score = float(iteration)  # without evaluations the latest wins
-        if config.eval_episodes:
-            row |= _scores(spec, policy.eval(), config)
-            score = row["success_once"]
-            policy.train()
-        if score > best:
-            best, best_state = score, {k: v.clone() for k, v in policy.state_dict().items()}
+        with average.in_place() if average else contextlib.nullcontext():
+            if config.eval_episodes:
+                row |= _scores(spec, policy.eval(), config)
+                score = row["success_once"]
+                policy.train()
+            if score > best:
+                best, best_state = score, {k: v.clone() for k, v in policy.state_dict().items()}
         history.append(row)
         if progress:
             progress(row)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import copy
+import dataclasses
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -15,11 +16,11 @@ import numpy as np
 import torch
 from torch import nn
 
-from .decorated import Decorated, save_decorated
+from .decorated import Decorated, flat_actions, save_decorated
 from .decorator import compose, gate, gate_probability, scaled
 from .demos.format import Demos
 from .errors import PdkitError
-from .online_config import OnlineConfig, lr_factor, stops
+from .online_config import OnlineConfig, decision_reward, lr_factor, stops
 from .online_eval import Evaluations
 from .online_rows import demo_rows, last_observation
 from .policies import Policy
@@ -39,11 +40,14 @@ class Trainer:
 
     def __init__(self, config: OnlineConfig, base: Policy, demos: Demos | None = None, spec: TaskSpec | None = None):
         pick_device(config.device)  # an error where it is not there
-        self.config, self.base = config, base.eval().to(config.device)
+        # The factors of alpha hold for each action of a chunk.
+        decorator = dataclasses.replace(config.decorator, alpha_scale=config.decorator.alpha_scale * base.chunk)
+        self.config, self.base = dataclasses.replace(config, decorator=decorator), base.eval().to(config.device)
         # A spec of its own is for worlds outside the registry, such as the probes; with start_fraction both become a shorter task.
         self.spec = horizon_spec(spec or get_task(config.task), config.start_fraction)
-        if base.chunk != 1:
-            raise PdkitError("The online loop decorates policies that return one action at a time.")
+        if base.chunk != 1 and not self.chunks:
+            raise PdkitError(f"{config.method} takes one action at a time, and this {base.kind} policy decides on {base.chunk} at once: "
+                             "start from another one, or from the same with chunk=1.")
         if base.config["obs_dim"] != self.spec.obs_dim or base.config["act_dim"] != self.spec.act_dim:
             raise PdkitError(f"This base policy is for {base.config['obs_dim']} observations and {base.config['act_dim']} actions; "
                              f"{self.spec.name} has {self.spec.obs_dim} and {self.spec.act_dim}.")
@@ -77,19 +81,26 @@ class Trainer:
         """Width of what `_view` gives."""
         return self.spec.obs_dim
 
+    @property
+    def act_dim(self) -> int:
+        """Numbers in one decision: the actions of a chunk, one after the other. Residuals and critics take it as one action."""
+        return self.spec.act_dim * self.base.chunk
+
+    chunks = True  # whether base policies may decide on several actions at once
+
     def _make_agent(self) -> SAC:
         c = self.config
-        return SAC(self.spec.obs_dim, self.spec.act_dim, c.sac, c.decorator, device=c.device,
+        return SAC(self.spec.obs_dim, self.act_dim, c.sac, c.decorator, device=c.device,
                    normalize=self.base.normalizer if c.normalize_obs else None)
 
     def _make_replay(self, capacity: int) -> Replay:
-        return Replay(capacity, self.stored_dim, self.spec.act_dim, device=self.config.device)
+        return Replay(capacity, self.stored_dim, self.act_dim, device=self.config.device)
 
     def _make_nstep(self, lanes: int) -> NStep:
         return NStep(lanes, self.config.n_step, self.config.gamma)
 
     def _demo_rows(self, demos: Demos) -> list[np.ndarray]:
-        return demo_rows(demos, self.base, self.config, self._view)
+        return demo_rows(demos, self.base, self.config, self._view, rest=self.spec.resting)
 
     needs_demos = False  # even when none are mixed into batches
     offline_updates = 0  # made by `_offline`; those of the loop come on top
@@ -135,7 +146,8 @@ class Trainer:
         Raises PdkitError when a loss or weight stops being finite; the last checkpoint is then still good.
         """
         c = self.config
-        envs = VectorEnv(self.spec, c.num_envs, self._next_seed, window=self.base.window, workers=c.env_workers,
+        envs = VectorEnv(self.spec, c.num_envs, self._next_seed, window=self.base.window, chunk=self.base.chunk,
+                         workers=c.env_workers,
                          terminate_on_success=c.on_success == "terminate", success_tail=c.success_tail,
                          max_episode_steps=shortened(c.train_limit, c.start_fraction) or None)
         with envs, contextlib.closing(self._evaluations()) as evaluations:
@@ -155,7 +167,7 @@ class Trainer:
                 started = time.monotonic()
                 before = self.step
                 residual = self._explore(self._view(windows), base)
-                envs.send(compose(c.decorator, base, residual)[:, None])
+                envs.send(compose(c.decorator, base, residual).reshape(len(base), self.base.chunk, -1))
                 self.sizes += np.abs(scaled(c.decorator, residual)).mean(1).sum(), np.abs(base).mean(1).sum(), len(base)
                 self._learn()
                 result = envs.receive()
@@ -191,7 +203,7 @@ class Trainer:
             return windows, snapshot["base"].astype(np.float32)
         self.base.reset(self.config.seed)
         windows = envs.reset()
-        return windows, self.base.act(windows)[:, 0]
+        return windows, flat_actions(self.base, windows)
 
     def _explore(self, obs: np.ndarray, base: np.ndarray) -> np.ndarray:
         """Gated residuals (N, act_dim) to execute and store."""
@@ -217,20 +229,20 @@ class Trainer:
             self.log |= self.agent.update(self.replay.unpack(rows), self.generator)
 
     def _base_actions(self, result) -> tuple[np.ndarray, np.ndarray]:
-        """Base actions (N, act_dim) to act on next, and those at the true successors: the base policy runs once for each
+        """Base actions (N, self.act_dim) to act on next, and those at the true successors: the base policy runs once for each
         distinct window, so only episodes that just ended cost a second one."""
         ended = np.flatnonzero(result.done)
-        actions = self.base.act(np.concatenate([result.windows, result.final_windows[ended]]))[:, 0]
+        actions = flat_actions(self.base, np.concatenate([result.windows, result.final_windows[ended]]))
         upcoming, final = actions[: len(result.windows)], actions[: len(result.windows)].copy()
         final[ended] = actions[len(result.windows):]
         return upcoming, final
 
     def _store(self, obs, residual, base, result, base_final) -> None:
-        c, final = self.config, self._view(result.final_windows)
+        c, final, reward = self.config, self._view(result.final_windows), decision_reward(self.config, result.reward)
         for i in range(c.num_envs):
             stop = stops(c, bool(result.terminated[i]), bool(result.truncated[i]))
-            self.replay.add(self.nstep.push(i, obs[i], residual[i], base[i], float(result.reward[i]) + c.reward_shift,
-                                            final[i], base_final[i], stop, bool(result.done[i])))
+            self.replay.add(self.nstep.push(i, obs[i], residual[i], base[i], float(reward[i]), final[i], base_final[i], stop,
+                                            bool(result.done[i])))
 
     def _crossed(self, before: int, every: int) -> bool:
         """Whether a multiple of `every` steps (or the end) lies between `before` and now."""
@@ -301,7 +313,7 @@ class Trainer:
         replay = torch.from_numpy(arrays["replay"])
         self.replay.rows[: len(replay)] = replay
         self.replay.size, self.replay.position = len(replay), values["position"]
-        self.nstep.load(group("nstep"), self.stored_dim, self.spec.act_dim)
+        self.nstep.load(group("nstep"), self.stored_dim, self.act_dim)
         self.generator.set_state(torch.from_numpy(arrays["generator"]))
         torch.set_rng_state(torch.from_numpy(arrays["torch_rng"]))
         self.rng.bit_generator.state = values["rng"]

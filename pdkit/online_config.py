@@ -3,6 +3,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from .decorator import DecoratorConfig
 from .errors import PdkitError, unknown
 from .methods.config import MethodConfig
@@ -30,7 +32,7 @@ class OnlineConfig:
     demo_fraction: float = 0.25  # of each batch, drawn from the demonstrations
     n_step: int = 5
     gamma: float = 0.97
-    reward_shift: float = -1.0  # added to the sparse 0/1 reward of every decision
+    reward_shift: float = -1.0  # added to the sparse 0/1 reward of every decision (see decision_reward)
     train_limit: int = 0  # time limit of training episodes (0: the task's); shorter ones spend fewer steps on lost episodes
     on_success: str = "continue"  # training episodes go on when solved, or end ("terminate")
     start_fraction: float = 0.0  # episodes start this far along a way to success, time limits shrink alike (pdkit/tasks/horizon.py); 0: not
@@ -71,6 +73,15 @@ class OnlineConfig:
 def stops(config: OnlineConfig, terminated: bool, truncated: bool) -> bool:
     """Whether the value of s' is left out of the target at this transition."""
     return {"truncated": terminated, "never": terminated or truncated, "always": False}[config.bootstrap]
+
+
+def decision_reward(config: OnlineConfig, solved: np.ndarray) -> np.ndarray:
+    """Rewards (N,) of decisions during which the task was solved at `solved` (N,) primitive steps: 1 or 0, plus the shift.
+
+    A chunk of actions is one decision: it is rewarded once, and the discount counts it once. That is what the paper's code does
+    where success ends the episode (facts.md 1.2); where episodes go on it would add the primitive steps up.
+    """
+    return np.minimum(solved, 1) + config.reward_shift
 
 
 def lr_factor(config: OnlineConfig, step: int) -> float:

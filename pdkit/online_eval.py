@@ -100,7 +100,8 @@ def _score(spec: TaskSpec, policy: Policy | Decorated, actor: nn.Module, episode
     actor.load_state_dict(weights)
     state = torch.get_rng_state()  # a base policy may draw from torch's global generator, and so does training
     policy.reset(seed)
-    table = evaluate(spec, policy.act, selection_seeds(episodes), window=policy.window, num_envs=LANES)
+    table = evaluate(spec, policy.act, selection_seeds(episodes), window=policy.window, chunk=policy.chunk,
+                     num_envs=LANES)
     torch.set_rng_state(state)
     return {"success_once": float(table.success_once.mean()), "success_at_end": float(table.success_at_end.mean()),
             "eval_seconds": time.monotonic() - started}

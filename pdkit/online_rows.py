@@ -5,9 +5,10 @@ from collections.abc import Callable
 
 import numpy as np
 
+from .decorated import flat_actions
 from .decorator import scaled
 from .demos.format import Demos
-from .online_config import OnlineConfig, stops
+from .online_config import OnlineConfig, decision_reward, stops
 from .policies import Policy
 from .rl.replay import NStep
 
@@ -18,13 +19,15 @@ def last_observation(windows: np.ndarray) -> np.ndarray:
 
 
 def demo_rows(demos: Demos, base: Policy, config: OnlineConfig,
-              view: Callable[[np.ndarray], np.ndarray] = last_observation, steps: NStep | None = None) -> list[np.ndarray]:
+              view: Callable[[np.ndarray], np.ndarray] = last_observation, steps: NStep | None = None,
+              rest: Callable[[np.ndarray], np.ndarray] = np.copy) -> list[np.ndarray]:
     """Demonstrations as replay rows: the residual stored is the one that makes the executed action the demonstrated one.
 
     An episode ends as training episodes do: at its first success with on_success="terminate", else at its own end, as a
-    time limit (the value of its last state counts). `steps` makes the rows (one lane).
+    time limit (the value of its last state counts). `steps` makes the rows (one lane); `rest` says from an episode's last action what
+    fills its last chunk up (TaskSpec.resting).
     """
-    steps, rows = steps or NStep(1, config.n_step, config.gamma), []
+    steps, rows, chunk = steps or NStep(1, config.n_step, config.gamma), [], base.chunk
     for episode in demos.episodes():
         observations, actions, success = episode["observations"], episode["actions"], episode["success"]
         length = len(actions)
@@ -32,11 +35,16 @@ def demo_rows(demos: Demos, base: Policy, config: OnlineConfig,
             length = int(np.argmax(success)) + 1
         padded = np.concatenate([np.repeat(observations[:1], base.window - 1, axis=0), observations])
         windows = np.lib.stride_tricks.sliding_window_view(padded, base.window, axis=0).transpose(0, 2, 1)[: length + 1]
-        bases, seen = base.act(windows)[:, 0], view(windows)
-        residuals = (actions[:length] - bases[:length]) / np.maximum(scaled(config.decorator, np.ones_like(bases[:length])), 1e-6)
-        for t in range(length):
-            last = t == length - 1
-            terminated = last and config.on_success == "terminate" and bool(success[t])
-            rows += steps.push(0, seen[t], residuals[t], bases[t], float(success[t]) + config.reward_shift, seen[t + 1],
-                               bases[t + 1], stops(config, terminated, last and not terminated), last)
+        bases, seen = flat_actions(base, windows), view(windows)
+        followed = np.concatenate([actions[:length], np.repeat(rest(actions[length - 1])[None], chunk - 1, axis=0)])
+        taken = np.lib.stride_tricks.sliding_window_view(followed, chunk, axis=0).transpose(0, 2, 1).reshape(length, -1)
+        residuals = (taken - bases[:length]) / np.maximum(scaled(config.decorator, np.ones_like(taken)), 1e-6)
+        for first in range(min(chunk, length)):  # a chunk may begin at any step: one way through the episode for each
+            for t in range(first, length, chunk):
+                after = min(t + chunk, length)
+                last = after == length
+                terminated = last and config.on_success == "terminate" and bool(success[length - 1])
+                reward = decision_reward(config, success[t:after].sum())
+                rows += steps.push(0, seen[t], residuals[t], bases[t], float(reward), seen[after], bases[after],
+                                   stops(config, terminated, last and not terminated), last)
     return rows

@@ -99,7 +99,7 @@ def _base(args) -> int:
     for name in settings:
         if name not in fields | set(architecture):
             raise unknown("field", name, fields | set(POLICIES[args.policy].defaults))
-    config = checked(ImitateConfig, {k: v for k, v in settings.items() if k in fields})
+    config = checked(ImitateConfig, POLICIES[args.policy].training | {k: v for k, v in settings.items() if k in fields})
     out = Path(args.out) if args.out else runs_root() / "base" / f"{args.task}-{args.policy}"
     print(f"{args.policy} on {demos.num} demonstrations of {args.task} ({demos.label}): {config}", flush=True)
     policy, history = imitate(args.policy, demos, config, architecture,
@@ -194,7 +194,8 @@ def decorate(config, base: Policy, demos: Demos | None, out: Path, episodes: int
 
 def _episodes(actor: Policy | Decorated, spec: TaskSpec, episodes: int) -> pd.DataFrame:
     actor.reset(0)
-    return evaluate(spec, actor.act, reported_seeds(episodes), window=actor.window, num_envs=50)
+    return evaluate(spec, actor.act, reported_seeds(episodes), window=actor.window, chunk=actor.chunk,
+                    num_envs=50)
 
 
 def _base_episodes(base: Policy, spec: TaskSpec, episodes: int, config: OnlineConfig, weights: str) -> pd.DataFrame:

@@ -118,7 +118,9 @@ def test_windows_pair_each_observation_with_the_action_taken_there():
 
 
 @pytest.mark.parametrize(("kind", "config", "lr"), [("bet", dict(window=4, bins=2, layers=1, heads=2, embed=32, features=32), 3e-3),
-                                                    ("mlp", dict(hidden=64), 3e-3)])
+                                                    ("mlp", dict(hidden=64), 3e-3),
+                                                    ("rnn", dict(window=4, hidden=32, layers=1), 3e-3),
+                                                    ("cnn", dict(window=4, hidden=32, layers=2), 3e-3)])
 def test_imitation_learns(kind, config, lr):
     demos = line_demos(20, 20)
     settings = ImitateConfig(iterations=400, batch=64, lr=lr, eval_episodes=0, eval_every=400, bf16=False)

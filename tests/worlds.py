@@ -3,7 +3,7 @@ import numpy as np
 import torch
 
 from pdkit.demos import Demos
-from pdkit.probes import PROBES
+from pdkit.probes import PROBES, ProbeBase
 
 
 def reach_demos(num=20, aim=(0.0, 0.0), first_seed=0, spec=PROBES["reach"]):
@@ -24,6 +24,15 @@ def reach_demos(num=20, aim=(0.0, 0.0), first_seed=0, spec=PROBES["reach"]):
                  np.array([len(a) for a in actions]), np.array(seeds))
 
 
+class TwoAtOnce(ProbeBase):
+    """A probe's base policy that decides on two actions at once: the second repeats the first."""
+
+    chunk = 2
+
+    def forward(self, windows):
+        return super().forward(windows).repeat(1, 2, 1)
+
+
 def clone(kind, demos, config, iterations=300, lr=3e-3, seed=0):
     """A policy class trained on demonstrations of a probe, whole trajectories cut into windows."""
     from pdkit.imitate import Windows
@@ -31,7 +40,7 @@ def clone(kind, demos, config, iterations=300, lr=3e-3, seed=0):
     torch.manual_seed(seed)
     policy = kind({"obs_dim": 4, "act_dim": 2} | config)
     policy.fit_statistics(demos.observations, demos.actions)
-    windows, generator = Windows(demos, policy.window, True), torch.Generator().manual_seed(seed)
+    windows, generator = Windows(demos, policy.window, True, policy.horizon), torch.Generator().manual_seed(seed)
     optimizer = torch.optim.Adam(policy.parameters(), lr=lr)
     policy.train()
     for _ in range(iterations):

@@ -41,17 +41,18 @@ def _play(policy: Policy, spec: TaskSpec, seeds: Sequence[int], lanes: int, nois
     """One whole episode for each seed, in lists of those that end together: observations, actions as executed, success and seed."""
     queue = list(seeds)[::-1]
     rng = np.random.default_rng(seeds[0])
-    with VectorEnv(spec, lanes, lambda lane: queue.pop() if queue else IDLE, window=policy.window, max_episode_steps=limit) as envs:
+    with VectorEnv(spec, lanes, lambda lane: queue.pop() if queue else IDLE, window=max(policy.window, policy.chunk),
+                   chunk=policy.chunk, max_episode_steps=limit) as envs:
         windows = envs.reset()
         open_episodes = [[] for _ in range(lanes)]
         playing = len(seeds)
         while playing:
-            actions = policy.act(windows)
+            actions = policy.act(windows[:, -policy.window:])
             actions = np.clip(actions + noise * rng.standard_normal(actions.shape), -1, 1).astype(np.float32)
             result = envs.step(actions)
             for i in range(lanes):
-                if result.steps[i]:
-                    open_episodes[i].append((windows[i, -1], actions[i, 0], bool(result.reward[i]), result.final_windows[i, -1]))
+                seen = np.concatenate([windows[i, -1:], result.final_windows[i, -policy.chunk:]])[-result.steps[i] - 1:]
+                open_episodes[i] += [(seen[k], actions[i, k], result.solved[i, k], seen[k + 1]) for k in range(result.steps[i])]
             ended = []
             for e in result.episodes:
                 steps, open_episodes[e.lane] = open_episodes[e.lane], []

@@ -73,6 +73,8 @@ class JSRL(Trainer):
     The number of guided steps is a buffer of the actor: it goes wherever its weights go, to evaluations, checkpoints and disk.
     """
 
+    chunks = False
+
     def __init__(self, config, base, demos=None, spec=None):
         if config.decorator.alpha != 1 or config.decorator.alpha_scale or config.decorator.H or config.demo_fraction:
             raise PdkitError("JSRL's learner acts by itself and without demonstrations: set alpha=1, alpha_scale=(), H=0, demo_fraction=0.")

@@ -24,7 +24,7 @@ import torch
 from ..decorator import gate
 from ..errors import PdkitError
 from ..online import Trainer
-from ..online_config import lr_factor, stops
+from ..online_config import decision_reward, lr_factor, stops
 from ..rl.gpt_critic import GPTCritics, make_backbone
 from ..rl.ppo import PPO, ROLLOUT_COLUMNS
 from ..rl.replay import Replay
@@ -47,11 +47,11 @@ class OnPolicy(Trainer):
     def _make_replay(self, capacity: int) -> Replay:
         """One rollout; a checkpoint holds what there is of it, as of any replay."""
         rows = self.config.method_config.ppo_rollout * self.config.num_envs
-        return Replay(rows, self.stored_dim, self.spec.act_dim, device=self.config.device, extra=ROLLOUT_COLUMNS)
+        return Replay(rows, self.stored_dim, self.act_dim, device=self.config.device, extra=ROLLOUT_COLUMNS)
 
     def _make_agent(self) -> PPO:
         c = self.config
-        return PPO(self.spec.obs_dim, self.spec.act_dim, c.method_config, c.sac, c.decorator, device=c.device,
+        return PPO(self.spec.obs_dim, self.act_dim, c.method_config, c.sac, c.decorator, device=c.device,
                    normalize=self.base.normalizer if c.normalize_obs else None)
 
     @property
@@ -74,7 +74,7 @@ class OnPolicy(Trainer):
 
     def _store(self, obs, residual, base, result, base_final) -> None:
         c, (u, log_prob, on) = self.config, self._acted
-        reward = (result.reward + c.reward_shift) * self.reward_scale
+        reward = decision_reward(c, result.reward) * self.reward_scale
         stop = [stops(c, bool(t), bool(limit)) for t, limit in zip(result.terminated, result.truncated, strict=True)]
         parts = [obs, u, base, reward[:, None], self._view(result.final_windows), base_final, np.where(stop, 0, c.gamma)[:, None],
                  log_prob, on, result.done[:, None]]

@@ -45,6 +45,8 @@ class Policy(nn.Module):
     kind = ""  # its name in POLICIES
     window = 1  # observations it looks at
     chunk = 1  # primitive actions it returns
+    horizon = 0  # actions it learns from the first observation of a window on; 0: one for each observation
+    training: dict[str, Any] = {}  # how it is trained where that differs from the defaults of ImitateConfig
     learns = True  # by gradient steps on `loss`; otherwise `remember` is all there is
 
     def __init__(self, config: dict[str, Any]):
@@ -74,7 +76,7 @@ class Policy(nn.Module):
         raise NotImplementedError
 
     def loss(self, windows: torch.Tensor, actions: torch.Tensor) -> dict[str, torch.Tensor]:
-        """Imitation loss for windows (B, window, obs_dim) and the actions taken at each position (B, window, act_dim);
+        """Imitation loss for windows (B, window, obs_dim) and the actions from the first position on (B, horizon or window, act_dim);
         a dict of scalars of which `loss` is minimised."""
         raise NotImplementedError
 

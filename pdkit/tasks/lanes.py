@@ -58,7 +58,7 @@ class _Lanes:
             observations, successes, terminated, truncated = lane.step(arrays["actions"][i])
             taken = len(observations)
             arrays["observations"][i, :taken] = observations
-            arrays["steps"][i], arrays["reward"][i] = taken, successes.sum()
+            arrays["solved"][i, :taken], arrays["steps"][i] = successes, taken
             arrays["ended"][i] = (terminated, truncated)
             if terminated or truncated:
                 arrays["episode"][i] = (lane.seed, lane.length, lane.once, successes[-1])

@@ -296,5 +296,6 @@ MANISKILL_TASKS = (
         summary="A Panda arm must put the red cube on the green one and let go.",
         joints=9,
         rate=20.0,
+        held_actions=(3,),
     ),
 )

@@ -38,8 +38,20 @@ class TaskSpec:
     max_episode_steps: int  # the paper's limit, in primitive steps
     control: str  # what an action means
     success_rule: str  # in words; judged at every step
-    absolute_actions: bool  # actions are targets (pad a chunk by repeating the last), not deltas (pad with zeros)
+    absolute_actions: bool  # actions are targets, not displacements or velocities
     make: Callable[..., Sim]  # make(render=False) -> Sim
     summary: str = ""  # one sentence for people
     joints: int = 0  # the first so many numbers of an observation are the robot's joint positions
     rate: float = 1.0  # primitive steps a second
+    held_actions: tuple[int, ...] = ()  # where actions are not targets: the dimensions that are all the same, such as a gripper's
+
+    def resting(self, action: np.ndarray) -> np.ndarray:
+        """What to do after `action` (act_dim,) so that nothing moves on: the same targets, and no displacement.
+
+        It fills action sequences up behind the end of a demonstration (facts.md 2.2: zeros are wrong for absolute targets).
+        """
+        if self.absolute_actions:
+            return action.copy()
+        rest = np.zeros_like(action)
+        rest[list(self.held_actions)] = action[list(self.held_actions)]
+        return rest

@@ -34,11 +34,16 @@ class StepResult:
 
     windows: np.ndarray  # (N, window, obs_dim) to act on next, after any reset
     final_windows: np.ndarray  # (N, window, obs_dim) the true successor, before any reset
-    reward: np.ndarray  # (N,) sparse: number of primitive steps of the chunk at which the task was solved
+    solved: np.ndarray  # (N, chunk) whether the task was solved at each primitive step; false where none was taken
     terminated: np.ndarray  # (N,) the episode ended because the task was solved (only with terminate_on_success)
     truncated: np.ndarray  # (N,) the episode ended at the time limit
     steps: np.ndarray  # (N,) primitive steps taken; 0 for an idle lane
     episodes: list[Episode] = field(default_factory=list)
+
+    @property
+    def reward(self) -> np.ndarray:
+        """(N,) sparse: number of primitive steps of the decision at which the task was solved."""
+        return self.solved.sum(axis=1).astype(np.float32)
 
     @property
     def done(self) -> np.ndarray:
@@ -72,7 +77,7 @@ class VectorEnv:
         shapes = {
             "actions": ((num_envs, chunk, spec.act_dim), np.float32), "seeds": ((num_envs,), np.int64),
             "observations": ((num_envs, chunk, spec.obs_dim), np.float32), "first": ((num_envs, spec.obs_dim), np.float32),
-            "reward": ((num_envs,), np.float32), "steps": ((num_envs,), np.int64), "ended": ((num_envs, 2), np.bool_),
+            "solved": ((num_envs, chunk), np.bool_), "steps": ((num_envs,), np.int64), "ended": ((num_envs, 2), np.bool_),
             "episode": ((num_envs, 4), np.int64),
         }
         arguments = (spec, self.limit, terminate_on_success, success_tail)
@@ -107,7 +112,7 @@ class VectorEnv:
         self._backend.receive()
         arrays = self._arrays
         steps = arrays["steps"].copy()
-        reward = np.where(steps > 0, arrays["reward"], 0).astype(np.float32)
+        solved = arrays["solved"] & (np.arange(self.chunk) < steps[:, None])
         ended = arrays["ended"] & (steps > 0)[:, None]
         final = self._windows.copy()
         for i, taken in enumerate(steps):
@@ -123,7 +128,7 @@ class VectorEnv:
             self._histories[i] = (int(self._upcoming[i]), [])
             self._windows[i] = arrays["first"][i]
             self._upcoming[i] = self._next_seed(int(i))
-        return StepResult(self._windows.copy(), final, reward, ended[:, 0].copy(), ended[:, 1].copy(), steps, episodes)
+        return StepResult(self._windows.copy(), final, solved, ended[:, 0].copy(), ended[:, 1].copy(), steps, episodes)
 
     def step(self, actions: np.ndarray) -> StepResult:
         self.send(actions)

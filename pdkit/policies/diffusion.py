@@ -1,0 +1,93 @@
+"""Diffusion Policy (Chi et al., 2023) as Policy Decorator trains it (facts.md 2.2): denoise a sequence of actions.
+
+    training   eps ~ N(0, I), step k uniform:  loss = |eps - eps_theta(sqrt(abar_k) a + sqrt(1 - abar_k) eps, k, o)|^2
+    acting     from pure noise, DDIM (few steps, no noise added) or DDPM (all steps) down to a; of the `horizon` actions the `chunk`
+               that begin at the latest observation are executed, then the policy looks again
+
+The sequence begins with the oldest observation of the window, so its first `window - 1` actions lie in the past.
+"""
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+
+from ..errors import PdkitError, unknown
+from .base import Normalizer, Policy
+from .unet import UNet
+
+SAMPLERS = ("ddim", "ddpm")
+
+
+class DiffusionPolicy(Policy):
+    """Config: obs_dim, act_dim, window (observations), horizon (actions predicted), chunk (of them executed), dims, kernel, groups and
+    embed of the U-Net, diffusion_steps of training, sampler ("ddim", "ddpm") and sampler_steps."""
+
+    kind = "diffusion"
+    defaults: dict[str, Any] = dict(window=2, horizon=16, chunk=4, dims=[64, 128, 256], kernel=5, groups=8, embed=64, diffusion_steps=100,
+                                    sampler="ddim", sampler_steps=4)
+    training: dict[str, Any] = dict(lr=1e-4, beta1=0.95, weight_decay=1e-6, schedule="cosine", lr_warmup=500, ema_power=0.75)
+
+    def __init__(self, config: dict[str, Any]):
+        super().__init__(self.defaults | config)
+        c = self.config
+        self.window, self.chunk, self.horizon = c["window"], c["chunk"], c["horizon"]
+        shortest = 2 ** (len(c["dims"]) - 1)
+        if self.horizon % shortest:
+            raise PdkitError(f"Diffusion Policy's horizon ({self.horizon}) must be a multiple of {shortest}: its U-Net halves the time "
+                             f"{len(c['dims']) - 1} times.")
+        if not 1 <= self.chunk <= self.horizon - self.window + 1:
+            raise PdkitError(f"Diffusion Policy's chunk ({self.chunk}) must be at least 1 and fit between the latest of {self.window} "
+                             f"observations and the horizon ({self.horizon}).")
+        if any(d % c["groups"] for d in c["dims"]):
+            raise PdkitError(f"Diffusion Policy's dims {c['dims']} must be multiples of its groups ({c['groups']}).")
+        if not 1 <= c["sampler_steps"] <= c["diffusion_steps"]:
+            raise PdkitError(f"sampler_steps must be from 1 to diffusion_steps ({c['diffusion_steps']}), not {c['sampler_steps']}.")
+        self.normalizer = Normalizer(c["obs_dim"])
+        self.unet = UNet(c["act_dim"], c["obs_dim"] * self.window, tuple(c["dims"]), c["kernel"], c["groups"], c["embed"])
+        self.noise = _scheduler("ddpm", c["diffusion_steps"])
+        self.sampler = _scheduler(c["sampler"], c["diffusion_steps"])
+        self.sampler.set_timesteps(c["sampler_steps"] if c["sampler"] == "ddim" else c["diffusion_steps"])
+
+    def fit_statistics(self, observations: np.ndarray, actions: np.ndarray, seed: int = 0) -> None:
+        self.normalizer.fit(observations)
+
+    def condition(self, windows: torch.Tensor) -> torch.Tensor:
+        """What the U-Net sees of windows (N, window, obs_dim): (N, window * obs_dim)."""
+        return self.normalizer(windows).flatten(1)
+
+    def loss(self, windows: torch.Tensor, actions: torch.Tensor) -> dict[str, torch.Tensor]:
+        noise = torch.randn(actions.shape).to(actions.device)  # drawn on the CPU everywhere: one generator to restore
+        steps = torch.randint(self.config["diffusion_steps"], (len(actions),)).to(actions.device)
+        predicted = self.unet(self.noise.add_noise(actions, noise, steps), steps, self.condition(windows))
+        return {"loss": F.mse_loss(predicted.float(), noise)}
+
+    def denoise(self, windows: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
+        """All actions (N, horizon, act_dim) that pure noise of that shape becomes."""
+        actions, condition = noise, self.condition(windows)
+        for step in self.sampler.timesteps:
+            predicted = self.unet(actions, step.expand(len(actions)).to(actions.device), condition)
+            actions = self.sampler.step(predicted.float(), step, actions).prev_sample
+        return actions
+
+    def forward(self, windows: torch.Tensor) -> torch.Tensor:
+        noise = torch.randn(len(windows), self.horizon, self.config["act_dim"]).to(windows.device)
+        return self.denoise(windows, noise)[:, self.window - 1: self.window - 1 + self.chunk]
+
+    def parameter_groups(self, weight_decay: float) -> list[dict[str, Any]]:
+        return [{"params": list(self.parameters()), "weight_decay": weight_decay}]
+
+
+def _scheduler(name: str, steps: int):
+    """The noise schedule of diffusers with the paper's settings. Raises PdkitError for an unknown sampler."""
+    from diffusers.schedulers.scheduling_ddim import DDIMScheduler
+    from diffusers.schedulers.scheduling_ddpm import DDPMScheduler
+
+    if name not in SAMPLERS:
+        raise unknown("sampler", name, SAMPLERS)
+    settings = dict(num_train_timesteps=steps, beta_schedule="squaredcos_cap_v2", clip_sample=True, prediction_type="epsilon")
+    # DDIM's few steps begin a step's width below the last (4 of 100: 75, 50, 25, 0), not at the last itself: there next to nothing is
+    # left of the actions, and what they were, told from the predicted noise, would be a coin toss for each number.
+    return DDIMScheduler(**settings, timestep_spacing="leading") if name == "ddim" else DDPMScheduler(**settings)

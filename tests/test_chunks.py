@@ -1,0 +1,129 @@
+"""Base policies that decide on several actions at once: steps stay primitive, a decision is one transition of the learner."""
+import numpy as np
+import pytest
+import torch
+from worlds import TwoAtOnce, clone, reach_demos, reach_trainer
+
+from pdkit.decorated import Decorated, load_decorated, save_decorated
+from pdkit.decorator import DecoratorConfig
+from pdkit.demos.sources import rollouts
+from pdkit.errors import PdkitError
+from pdkit.evaluate import evaluate
+from pdkit.online_config import OnlineConfig, decision_reward
+from pdkit.online_rows import demo_rows
+from pdkit.policies import DiffusionPolicy
+from pdkit.probes import PROBES, ProbeBase
+from pdkit.profiles import build
+from pdkit.rl.networks import Actor
+
+BIASED = dict(obs_dim=4, act_dim=2, kind="reach", bias=[0.2, -0.2])
+
+
+def test_a_decision_is_rewarded_once_however_often_it_was_solved():
+    config = OnlineConfig(reward_shift=-1.0)
+    assert decision_reward(config, np.array([0, 1, 3])).tolist() == [-1, 0, 0]
+
+
+def config_of(**changes):
+    values = dict(task="reach", gamma=0.9, n_step=1, on_success="terminate", alpha=0.5, demo_fraction=0.25)
+    return build(OnlineConfig, values | changes)
+
+
+def test_demonstrations_begin_a_chunk_at_every_step():
+    demos = reach_demos(1, first_seed=3)
+    episode, base = demos.episode(0), ProbeBase(dict(obs_dim=4, act_dim=2, kind="zero"))
+    base.chunk, base.forward = 2, lambda windows: torch.zeros(len(windows), 2, 2)
+    length = len(episode["actions"])
+    assert length > 4 and episode["success"].tolist() == [False] * (length - 1) + [True]
+    rows = np.stack(demo_rows(demos, base, config_of(), rest=lambda last: np.float32([9, 9])))
+    obs, residual, _, reward, after, _, discount = np.split(rows, np.cumsum([4, 4, 4, 1, 4, 4]), axis=1)
+    followed = np.concatenate([episode["actions"], np.float32([[9, 9]])])
+    order = [*range(0, length, 2), *range(1, length, 2)]
+    assert len(rows) == length
+    for row, t in enumerate(order):
+        assert np.allclose(obs[row], episode["observations"][t]) and np.allclose(residual[row], followed[t: t + 2].ravel() / 0.5)
+        assert np.allclose(after[row], episode["observations"][min(t + 2, length)])
+        ends = t + 2 >= length
+        assert (reward[row, 0], discount[row, 0]) == ((0, 0) if ends else (-1, np.float32(0.9)))
+
+
+def test_several_steps_ahead_are_several_decisions_ahead():
+    demos = reach_demos(1, first_seed=3)
+    base = TwoAtOnce(dict(obs_dim=4, act_dim=2, kind="zero"))
+    one, two = (np.stack(demo_rows(demos, base, config_of(n_step=n))) for n in (1, 2))
+    assert np.allclose(two[0, 12], one[0, 12] + 0.9 * one[1, 12])  # rewards
+    assert np.allclose(two[0, 13:17], one[1, 13:17])  # where the second decision led
+
+
+def test_what_is_executed_is_the_sum_of_two_chunks_and_steps_are_primitive(monkeypatch):
+    trainer = reach_trainer("policy_decorator", TwoAtOnce(BIASED), alpha=0.3, alpha_scale=(1.0, 0.5), H=0, warmup="uniform",
+                            total_steps=600, warmup_steps=400, n_step=1)
+    executed, store = [], trainer._store
+
+    def spy(obs, residual, base, result, base_final):
+        executed.append((residual, base, result))
+        return store(obs, residual, base, result, base_final)
+
+    monkeypatch.setattr(trainer, "_store", spy)
+    trainer.train()
+    steps = sum(int(result.steps.sum()) for _, _, result in executed)
+    assert trainer.step == steps >= 600 and trainer.replay.size < steps / 1.5
+    assert trainer.agent.updates == int((steps - executed[-1][2].steps.sum() - 400) * 0.5)  # per primitive step
+    rows = trainer.replay.unpack(trainer.replay.rows[: trainer.replay.size])
+    assert rows["residual"].shape[1] == rows["base"].shape[1] == 4
+    first_residual, first_base, first_result = executed[0]
+    both = np.clip(first_base + first_residual * np.float32([0.3, 0.15, 0.3, 0.15]), -1, 1)  # the factors hold for each action
+    start = rows["obs"][: len(both), :2].numpy()
+    moved = np.clip(np.clip(start + 0.2 * both[:, :2], -1.5, 1.5) + 0.2 * both[:, 2:], -1.5, 1.5)
+    whole = first_result.steps == 2
+    assert whole.any() and np.allclose(first_result.final_windows[whole, -1, :2], moved[whole], atol=1e-5)
+
+
+def test_a_decorator_repairs_a_policy_that_acts_in_chunks():
+    base = TwoAtOnce(BIASED)
+    trainer = reach_trainer("policy_decorator", base, alpha=1.0, H=500, total_steps=4000, warmup="uniform")
+    policy = trainer.train()
+    seeds = range(10_000, 10_100)
+    before, after = (evaluate(PROBES["reach"], p.act, seeds, chunk=2).success_once.mean() for p in (base, policy))
+    assert before < 0.5 and after > before + 0.3
+
+
+def test_a_decorated_chunk_on_disk(tmp_path):
+    demos = reach_demos(5)
+    small = dict(window=2, horizon=4, chunk=3, dims=[16, 32], groups=4, embed=16)
+    base = clone(DiffusionPolicy, demos, small, iterations=2)
+    actor = Actor(4, 6, 8, 1, False, (-5.0, 2.0))
+    torch.nn.init.normal_(actor.head.weight)
+    policy = Decorated(base, actor, DecoratorConfig(alpha=0.2, alpha_scale=(1.0, 0.5) * 3))
+    save_decorated(policy, tmp_path / "d")
+    again, windows = load_decorated(tmp_path / "d"), np.random.default_rng(0).normal(size=(5, 2, 4)).astype(np.float32)
+    actions = []
+    for p in (policy, again):
+        p.reset(0)
+        actions.append(p.act(windows))
+    base.reset(0)
+    assert actions[0].shape == (5, 3, 2) and again.chunk == 3 and np.array_equal(*actions)
+    difference = np.abs(actions[0] - base.act(windows)).max(axis=(0, 1))
+    assert 0.05 < difference[0] <= 0.2 and 0.02 < difference[1] <= 0.1
+
+
+def test_motion_is_measured_within_chunks_too():
+    one, two = (evaluate(PROBES["reach"].__class__(**vars(PROBES["reach"]) | {"joints": 2}), act, range(5), chunk=chunk)
+                for act, chunk in ((lambda w: np.full((len(w), 1, 2), 0.5), 1), (lambda w: np.full((len(w), 2, 2), 0.5), 2)))
+    assert np.allclose(one.jerk, two.jerk) and one.jerk.notna().all() and (one.length == two.length).all()
+
+
+def test_rollouts_of_chunks_are_recorded_step_by_step():
+    """A constant action gives the same episodes whether it is decided on once or three times as often."""
+    seeds, played = range(4), []
+    for chunk in (1, 3):
+        policy = ProbeBase(dict(obs_dim=4, act_dim=2, kind="zero"))
+        policy.chunk, policy.act = chunk, lambda windows, chunk=chunk: np.full((len(windows), chunk, 2), 0.4, np.float32)
+        played.append(rollouts(policy, PROBES["reach"], seeds))
+    for name in ("observations", "actions", "success", "lengths"):
+        assert np.array_equal(getattr(played[0], name), getattr(played[1], name)), name
+
+
+def test_methods_for_single_actions_say_so():
+    with pytest.raises(PdkitError, match="decides on 2 at once"):
+        reach_trainer("jsrl", TwoAtOnce(BIASED), eval_every=1000, eval_episodes=5)

@@ -1,0 +1,176 @@
+"""Diffusion Policy: the noise schedule, the U-Net, sampling, training windows with a horizon, and what it is for: several ways at once."""
+import math
+
+import numpy as np
+import pytest
+import torch
+from test_policies import line_demos
+from worlds import clone, reach_demos
+
+from pdkit.errors import PdkitError
+from pdkit.evaluate import evaluate
+from pdkit.imitate import Average, ImitateConfig, Windows, imitate
+from pdkit.policies import DiffusionPolicy, load_policy, save_policy
+from pdkit.policies.unet import UNet, step_embedding
+from pdkit.probes import PROBES
+from pdkit.tasks import get_task
+
+SMALL = dict(obs_dim=3, act_dim=2, window=2, horizon=8, chunk=3, dims=[16, 32], groups=4, embed=16)
+
+
+def policy(**changes):
+    torch.manual_seed(0)
+    return DiffusionPolicy(SMALL | changes).eval()
+
+
+def alpha_bar(step, steps=100):
+    """The squared-cosine schedule (Nichol and Dhariwal, 2021), by hand: the product of 1 - beta, betas at most 0.999."""
+    def f(t):
+        return math.cos((t / steps + 0.008) / 1.008 * math.pi / 2) ** 2
+    return math.prod(1 - min(1 - f(k + 1) / f(k), 0.999) for k in range(step + 1))
+
+
+class Oracle(torch.nn.Module):
+    """Knows the clean actions, so it tells the noise exactly."""
+
+    def __init__(self, clean):
+        super().__init__()
+        self.clean, self.asked = clean, []
+
+    def forward(self, noisy, steps, condition):
+        self.asked.append(int(steps[0]))
+        bar = torch.tensor([alpha_bar(int(k)) for k in steps])[:, None, None]
+        return (noisy - bar.sqrt() * self.clean) / (1 - bar).sqrt()
+
+
+def test_the_network_is_told_step_and_observations():
+    torch.manual_seed(0)
+    unet = UNet(2, 6, (16, 32), 5, 4, 16).eval()
+    actions, steps, condition = torch.randn(3, 8, 2), torch.tensor([0, 5, 99]), torch.randn(3, 6)
+    out = unet(actions, steps, condition)
+    assert out.shape == (3, 8, 2)
+    for changed in ((actions + 1, steps, condition), (actions, steps + 1, condition), (actions, steps, condition + 1)):
+        assert not torch.allclose(out, unet(*changed), atol=1e-4)
+    assert torch.allclose(unet(actions[1:2], steps[1:2], condition[1:2]), out[1:2], atol=1e-5)  # rows do not see each other
+
+
+def test_step_embedding_has_fast_and_slow_waves():
+    e = step_embedding(torch.tensor([0, 3]), 8)
+    assert e.shape == (2, 8) and e[0].tolist() == [0, 0, 0, 0, 1, 1, 1, 1]
+    assert e[1, 0] == pytest.approx(math.sin(3)) and e[1, 3] == pytest.approx(math.sin(3e-4)) and e[1, 4] == pytest.approx(math.cos(3))
+
+
+class Silent(torch.nn.Module):
+    def forward(self, noisy, steps, condition):
+        return torch.zeros_like(noisy)
+
+
+def test_the_loss_is_that_of_the_noise_which_was_added():
+    p, clean = policy(), torch.rand(4, 8, 2) * 2 - 1
+    p.unet = Oracle(clean)
+    assert p.loss(torch.randn(4, 2, 3), clean)["loss"] < 1e-4
+    p.unet = Silent()
+    torch.manual_seed(0)
+    assert p.loss(torch.randn(500, 2, 3), torch.zeros(500, 8, 2))["loss"] == pytest.approx(1, abs=0.05)
+
+
+@pytest.mark.parametrize(("sampler", "steps", "asked"), [("ddim", 4, [75, 50, 25, 0]), ("ddpm", 4, list(range(99, -1, -1)))])
+def test_sampling_removes_the_noise_that_the_network_tells(sampler, steps, asked):
+    p, clean = policy(sampler=sampler, sampler_steps=steps), torch.rand(2, 8, 2) * 1.8 - 0.9
+    p.unet = Oracle(clean)
+    actions = p.denoise(torch.randn(2, 2, 3), torch.randn(2, 8, 2))
+    assert torch.allclose(actions, clean, atol=1e-3) and p.unet.asked == asked
+
+
+def test_a_chunk_begins_at_the_latest_observation():
+    p, clean = policy(), torch.arange(16.0).view(1, 8, 2) / 20
+    p.unet = Oracle(clean)
+    assert np.allclose(p.act(np.zeros((1, 2, 3), np.float32)), clean[:, 1:4], atol=1e-3)
+
+
+def test_reset_repeats_the_noise_and_disk_keeps_the_policy(tmp_path):
+    p, windows = policy(), np.random.default_rng(0).normal(size=(2, 2, 3)).astype(np.float32)
+    p.normalizer.fit(np.random.default_rng(1).normal(3, 2, (50, 3)).astype(np.float32))
+    p.reset(1)
+    first, second = p.act(windows), p.act(windows)
+    assert first.shape == (2, 3, 2) and not np.array_equal(first, second)
+    save_policy(p, tmp_path / "p")
+    again = load_policy(tmp_path / "p")
+    again.reset(1)
+    assert np.array_equal(again.act(windows), first)
+
+
+@pytest.mark.parametrize(("changes", "message"), [
+    (dict(horizon=7), "multiple of 2"), (dict(chunk=8), "fit between"), (dict(chunk=0), "at least 1"),
+    (dict(dims=[10, 32]), "multiples of"), (dict(sampler="euler"), "Unknown sampler"), (dict(sampler_steps=0), "from 1 to"),
+    (dict(sampler_steps=101), "from 1 to")])
+def test_settings_that_do_not_fit_are_refused(changes, message):
+    with pytest.raises(PdkitError, match=message):
+        policy(**changes)
+
+
+def test_windows_reach_beyond_the_end_with_actions_that_keep_still():
+    demos, door, cube = line_demos(3, 12), get_task("Door"), get_task("StackCube")
+    windows = Windows(demos, 2, True, 8, door.resting)
+    assert len(windows.index) == 3 * 12  # every observation is the latest of one window
+    for number, start in enumerate(windows.index.tolist()):
+        episode, t = demos.episode(number // 12), number % 12
+        observations, actions = windows.observations[start + windows.span], windows.actions[start + windows.ahead]
+        assert np.array_equal(observations, episode["observations"][[max(t - 1, 0), t]])
+        assert np.array_equal(actions, episode["actions"][np.clip(np.arange(t - 1, t + 7), 0, 11)])  # targets: the last one goes on
+    assert np.array_equal(cube.resting(np.array([0.3, -0.2, 0.1, -1.0], np.float32)), np.float32([0, 0, 0, -1]))  # the gripper stays shut
+    assert [x.shape for x in windows.sample(5, torch.Generator())] == [(5, 2, 39), (5, 8, 28)]
+
+
+def test_learning_rate_warms_up_and_falls_like_a_cosine():
+    config = ImitateConfig(iterations=110, lr_warmup=10, schedule="cosine")
+    assert [config.lr_factor(i) for i in (0, 5, 10, 60, 110)] == pytest.approx([0, 0.5, 1, 0.5, 0])
+    assert ImitateConfig().lr_factor(0) == ImitateConfig().lr_factor(1499) == 1
+    for bad in (dict(schedule="linear"), dict(lr_warmup=-1), dict(beta1=1.0), dict(ema_power=-0.5)):
+        with pytest.raises(PdkitError):
+            ImitateConfig(**bad)
+
+
+def test_averaged_weights_are_in_place_only_while_asked():
+    p = policy()
+    with torch.no_grad():
+        for parameter in p.parameters():
+            parameter.zero_()
+    average, expected = Average(p, 0.75), 0.0
+    for step in range(1, 5):
+        with torch.no_grad():
+            for parameter in p.parameters():
+                parameter.fill_(float(step))
+        average.step()
+        decay = 1 - step ** -0.75 if step > 1 else 0.0  # 1 - (1 + k)^-power with k, the steps before this one
+        expected = decay * expected + (1 - decay) * step
+    with average.in_place():
+        assert all(torch.allclose(x, torch.tensor(expected), atol=1e-5) for x in p.parameters())
+    assert all((x == 4).all() for x in p.parameters())
+
+
+def test_it_learns_two_ways_where_a_mean_would_be_neither():
+    """Half of the demonstrations go left, half right, from the same observations: sequences stay whole and on one side."""
+    demos = reach_demos(40)
+    demos.observations[:] = 0
+    demos.actions[:] = np.repeat(np.where(np.arange(40) % 2, 0.7, -0.7), demos.lengths)[:, None]
+    learned = clone(DiffusionPolicy, demos, dict(horizon=4, chunk=3, dims=[16, 32], groups=4, embed=16, sampler_steps=10), iterations=400)
+    actions = learned.act(np.zeros((200, 2, 4), np.float32))[..., 0]
+    assert (np.abs(actions) < 0.35).mean() < 0.1  # hardly anything in the middle
+    assert 0.2 < (actions[:, 0] > 0).mean() < 0.8  # both sides
+    assert (np.sign(actions) == np.sign(actions[:, :1])).all(axis=1).mean() > 0.9  # a sequence does not change its mind
+
+
+def test_it_goes_where_the_observation_says():
+    """On the reach probe, from demonstrations that go straight to the goal, in chunks of two actions."""
+    learned = clone(DiffusionPolicy, reach_demos(60), dict(horizon=4, chunk=2, dims=[16, 32], groups=4, embed=16), iterations=300)
+    learned.reset(0)
+    assert evaluate(PROBES["reach"], learned.act, range(500, 550), window=2, chunk=2).success_once.mean() > 0.4
+
+
+def test_the_averaged_weights_are_what_imitation_keeps():
+    """With a rate that moves weights far at each step, the kept weights are not the last ones but their average."""
+    demos, settings = line_demos(4, 12), dict(iterations=3, batch=16, lr=0.1, eval_episodes=0, eval_every=3, bf16=False)
+    small = dict(horizon=4, chunk=1, dims=[16, 32], groups=4, embed=16)
+    last, averaged = (imitate("diffusion", demos, ImitateConfig(**settings, ema_power=power), small)[0] for power in (0.0, 0.75))
+    assert (last.unet.out[1].bias - averaged.unet.out[1].bias).abs().max() > 0.01
