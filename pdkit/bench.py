@@ -22,7 +22,7 @@ from .rl.replay import Replay
 from .rl.sac import SAC, SACConfig
 from .runs import describe_machine
 from .tasks import get_task
-from .tasks.maniskill import StockStackCube
+from .tasks.stack_cube import StockStackCube
 from .tasks.vector import VectorEnv
 from .torch_setup import has_bf16, pick_device, set_threads
 

@@ -15,8 +15,9 @@ import pytest
 from pdkit.demos.experts import StackCubeExpert
 from pdkit.errors import PdkitError
 from pdkit.tasks import get_task
-from pdkit.tasks.maniskill import BASE_POSE, StackCube, StockStackCube
+from pdkit.tasks.maniskill import BASE_POSE
 from pdkit.tasks.maniskill_headless import render_device
+from pdkit.tasks.stack_cube import StackCube, StockStackCube
 
 # The fast step does ManiSkill's arithmetic in ManiSkill's order, so on x86 the two agree to the last bit, through every
 # contact. Elsewhere a compiler may fuse operations: then only the steps before the first contact can be compared.
@@ -171,13 +172,14 @@ def test_simulations_in_one_process_do_not_disturb_each_other():
 
 WITHOUT_VULKAN = """
 import hashlib, json, sys
-import pdkit.tasks.maniskill as maniskill
+import pdkit.tasks.stack_cube as stack_cube
+from pdkit.errors import PdkitError
 lazy = not {"sapien", "mani_skill", "gymnasium"} & set(sys.modules)
 from tests.test_maniskill import digest
-result = dict(lazy=lazy, digest=digest(maniskill.StackCube()))
+result = dict(lazy=lazy, digest=digest(stack_cube.StackCube()))
 try:
-    maniskill.StackCube(render=True)
-except maniskill.PdkitError as error:
+    stack_cube.StackCube(render=True)
+except PdkitError as error:
     result["error"] = str(error)
 print(json.dumps(result))
 """

@@ -3,10 +3,11 @@ from __future__ import annotations
 
 from ..errors import unknown
 from .adroit import ADROIT_TASKS
-from .maniskill import MANISKILL_TASKS
+from .peg import PEG_INSERTION_SIDE
 from .spec import Sim, TaskSpec
+from .stack_cube import STACK_CUBE
 
-TASKS: dict[str, TaskSpec] = {spec.name: spec for spec in (*MANISKILL_TASKS, *ADROIT_TASKS)}
+TASKS: dict[str, TaskSpec] = {spec.name: spec for spec in (STACK_CUBE, PEG_INSERTION_SIDE, *ADROIT_TASKS)}
 
 
 def get_task(name: str) -> TaskSpec:
