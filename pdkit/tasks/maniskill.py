@@ -22,9 +22,9 @@ from .panda import Panda
 
 BASE_POSE = slice(18, 25)  # where the base pose is put back: after 9 joint positions and 9 joint velocities
 POSE_CONTROL = (  # what an action of `pd_ee_delta_pose` means
-    "pd_ee_delta_pose: displacement (3) of the gripper in the robot's frame (1 = 10 cm), rotation (3) about that frame's axes (1 = 0.1 rad, "
-    "at most that altogether) and opening of the gripper, 20 Hz; ManiSkill 3.0.1 scales rotations by the lower bound of their range, so a "
-    "positive number turns in the negative sense"
+    "pd_ee_delta_pose: displacement (3) of the gripper in the robot's frame (1 = 10 cm), rotation (3) about that frame's axes "
+    "(1 = 0.1 rad, at most that altogether) and opening of the gripper, 20 Hz; ManiSkill 3.0.1 scales rotations by the lower bound of "
+    "their range, so a positive number turns in the negative sense"
 )
 
 
