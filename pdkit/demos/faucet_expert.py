@@ -47,15 +47,16 @@ class TurnFaucetExpert:
     def _target(self, tool: np.ndarray, contact: np.ndarray, behind: np.ndarray, onwards: np.ndarray, left: float) -> np.ndarray:
         """Where the hand should go now, metres; goes on to the next stage where its condition is met."""
         over = behind + UP * self.ABOVE
-        if self._stage == "over" and np.linalg.norm(tool - over) < 0.02:
+        if self._stage == "over" and np.linalg.norm(tool - over) < 0.03:
             self._stage, self._waited = "down", 0
         if self._stage == "down":
             self._waited += 1
-            if np.linalg.norm(tool - behind) < 0.012 or self._waited > self.STUCK_DOWN:
+            there = np.linalg.norm((tool - behind)[:2]) < 0.02 and abs(tool[2] - behind[2]) < 0.01
+            if there or self._waited > self.STUCK_DOWN:
                 self._stage, self._waited, self._least = "push", 0, left
         if self._stage == "push":
             self._waited += 1
-            if left < self._least - 0.01:
+            if left < self._least - 0.03:
                 self._least, self._waited = left, 0
             if self._waited > self.STUCK_PUSH:
                 self._stage, self._try = "over", (self._try + 1) % len(self.TRIES)

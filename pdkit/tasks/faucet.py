@@ -143,7 +143,7 @@ def _corners(shape: Any) -> np.ndarray:
     return corners @ to_link[:3, :3].T + to_link[:3, 3]
 
 
-def _spec(name: str, make: type[TurnFaucet], which: str) -> TaskSpec:
+def _spec(name: str, make: type[TurnFaucet], which: str, **options: str) -> TaskSpec:
     return TaskSpec(
         name=name,
         suite="maniskill",
@@ -157,8 +157,9 @@ def _spec(name: str, make: type[TurnFaucet], which: str) -> TaskSpec:
         summary=f"A Panda arm must push the handle of a faucet round; {which}.",
         joints=9,
         rate=20.0,
+        **options,
     )
 
 
-TURN_FAUCET = _spec("TurnFaucet", TurnFaucet, "3 faucets that no demonstration shows")
 TURN_FAUCET_SOURCE = _spec("TurnFaucetSource", TurnFaucetSource, "the 10 faucets of the demonstrations")
+TURN_FAUCET = _spec("TurnFaucet", TurnFaucet, "3 faucets that no demonstration shows", demo_task="TurnFaucetSource")

@@ -43,3 +43,4 @@ class TaskSpec:
     summary: str = ""  # one sentence for people
     joints: int = 0  # the first so many numbers of an observation are the robot's joint positions
     rate: float = 1.0  # primitive steps a second
+    demo_task: str = ""  # the task whose demonstrations are imitated, where it is another (other objects, same numbers)
