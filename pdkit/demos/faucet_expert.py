@@ -20,7 +20,7 @@ class TurnFaucetExpert:
 
     ABOVE = 0.09  # metres over the place behind the handle
     BEHIND = 0.022  # metres from the middle of a bar to that of the closed fingers that touch it
-    AHEAD = 0.05  # how far beyond the place of contact the hand aims while it pushes, metres
+    AHEAD = 0.09  # how far beyond the place of contact the hand aims while it pushes, metres
     TRIES = ((0.78, 0.045), (0.65, 0.06), (0.90, 0.04), (0.55, 0.07), (0.80, 0.05))  # where on the bar, and how far behind it to go down
     STUCK_DOWN, STUCK_PUSH = 40, 25  # steps after which it goes on, or comes again
 
