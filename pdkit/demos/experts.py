@@ -103,8 +103,12 @@ class StackCubeExpert:
         return tool, 0, self.OPEN
 
 
-EXPERTS: dict[str, Callable[..., Expert]] = {"StackCube": StackCubeExpert, "PegInsertionSide": PegInsertionSideExpert}
-EXPERTS |= {"TurnFaucet": TurnFaucetExpert, "TurnFaucetSource": TurnFaucetExpert}
+EXPERTS: dict[str, Callable[..., Expert]] = {
+    "StackCube": StackCubeExpert,
+    "PegInsertionSide": PegInsertionSideExpert,
+    "TurnFaucet": TurnFaucetExpert,
+    "TurnFaucetSource": TurnFaucetExpert,
+}
 
 
 def scripted_episodes(

@@ -28,7 +28,7 @@ class TurnFaucet(FastSim):
     """
 
     control = "pd_ee_delta_pose"
-    camera = ((0.4, 0.35, 0.45), (-0.08, 0.0, 0.12))
+    camera = ((0.5, 0.45, 0.5), (-0.15, 0.0, 0.22))
     novel: ClassVar[bool] = True
 
     def __init__(self, render: bool = False):
