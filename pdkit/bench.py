@@ -22,7 +22,9 @@ from .rl.replay import Replay
 from .rl.sac import SAC, SACConfig
 from .runs import describe_machine
 from .tasks import get_task
-from .tasks.maniskill import StockStackCube
+from .tasks.faucet import StockTurnFaucetSource
+from .tasks.peg import StockPegInsertionSide
+from .tasks.stack_cube import StockStackCube
 from .tasks.vector import VectorEnv
 from .torch_setup import has_bf16, pick_device, set_threads
 
@@ -44,9 +46,9 @@ def paired(first: Callable[[], int], second: Callable[[], int], seconds: float, 
             "ratio": float(np.median(ratios)), "ratio_min": min(ratios), "ratio_max": max(ratios), "rounds": rounds}
 
 
-def sim_stepper(sim, seed: int = 0, steps: int = 20) -> Callable[[], int]:
-    """Random actions in `sim`, an episode of 100 steps at a time: a call takes `steps` of them."""
-    actions = np.random.default_rng(seed).uniform(-1, 1, (100, 4)).astype(np.float32)
+def sim_stepper(sim, act_dim: int, seed: int = 0, steps: int = 20) -> Callable[[], int]:
+    """Random actions (act_dim,) in `sim`, an episode of 100 steps at a time: a call takes `steps` of them."""
+    actions = np.random.default_rng(seed).uniform(-1, 1, (100, act_dim)).astype(np.float32)
     state = {"t": 0}
 
     def work() -> int:
@@ -60,11 +62,21 @@ def sim_stepper(sim, seed: int = 0, steps: int = 20) -> Callable[[], int]:
     return work
 
 
+def _against_stock(fast, stock, act_dim: int, seconds: float) -> dict[str, float]:
+    return paired(sim_stepper(fast, act_dim), sim_stepper(stock, act_dim), seconds)
+
+
 def bench_step(seconds: float) -> dict[str, Any]:
-    """The fast StackCube step against stock ManiSkill's, one process; and two workers against stock, one process."""
+    """The fast StackCube step against stock ManiSkill's, one process; and two workers against stock, one process.
+
+    For the tasks with other objects in every episode the resets count too: stock ManiSkill builds its scene anew in each.
+    """
     spec = get_task("StackCube")
     fast, stock = spec.make(), StockStackCube()
-    out = {"fast step / stock ManiSkill, one process (steps/s)": paired(sim_stepper(fast), sim_stepper(stock), seconds)}
+    out = {"fast step / stock ManiSkill, one process (steps/s)": _against_stock(fast, stock, 4, seconds)}
+    for other, its_stock in (("PegInsertionSide", StockPegInsertionSide), ("TurnFaucetSource", StockTurnFaucetSource)):
+        out[f"{other}: fast step / stock ManiSkill, one process, resets included (steps/s)"] = _against_stock(
+            get_task(other).make(), its_stock(), get_task(other).act_dim, seconds)
     counts = [0] * 8
 
     def next_seed(lane: int) -> int:
@@ -80,7 +92,7 @@ def bench_step(seconds: float) -> dict[str, Any]:
                 envs.step(rng.uniform(-1, 1, (8, 1, 4)))
             return 80
 
-        out["fast step, two workers / stock, one process (steps/s)"] = paired(work, sim_stepper(stock), seconds)
+        out["fast step, two workers / stock, one process (steps/s)"] = paired(work, sim_stepper(stock, 4), seconds)
     fast.close()
     stock.close()
     return out
@@ -202,7 +214,7 @@ def main(argv: list[str]) -> int:
     set_threads(args.threads)
     device = pick_device(args.device)
     seconds = 0.2 if args.quick else args.seconds
-    print(f"About {'1 minute' if args.quick else '4 minutes'}; {args.threads} thread(s), bfloat16 in hardware: {has_bf16(device)}, "
+    print(f"About {'1 minute' if args.quick else '5 minutes'}; {args.threads} thread(s), bfloat16 in hardware: {has_bf16(device)}, "
           f"updates on {device}.", flush=True)
     results: dict[str, Any] = {}
     for part in (lambda: bench_step(seconds), lambda: bench_updates(seconds, device), lambda: bench_base(seconds)):

@@ -6,24 +6,34 @@ number of demonstrations comes from seeds alone.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
 from ..errors import PdkitError, unknown
 from ..tasks import get_task
+from .faucet_expert import TurnFaucetExpert
+from .peg_expert import PegInsertionSideExpert
 
 GIVE_UP = 50  # failures in a row after which a scripted expert is not worth waiting for
 
 
 class Expert(Protocol):
-    """A scripted controller for one task. It sees nothing but observations, but may remember what it is doing."""
+    """A scripted controller for one task. It sees nothing but observations (but see `Watching`); it may remember what it is doing."""
 
     def reset(self, rng: np.random.Generator) -> None:
         """Start an episode, with the random numbers for whatever is varied in it."""
 
     def act(self, observation: np.ndarray) -> np.ndarray:
         """The action (act_dim,) in [-1, 1], float32, for an observation (obs_dim,)."""
+
+
+@runtime_checkable
+class Watching(Protocol):
+    """A scripted controller that looks at the simulation too, because the observation does not show what it needs."""
+
+    def watch(self, sim: Any) -> None:
+        """Called once, before the first episode, with the simulation it will act in."""
 
 
 class StackCubeExpert:
@@ -93,7 +103,12 @@ class StackCubeExpert:
         return tool, 0, self.OPEN
 
 
-EXPERTS: dict[str, Callable[..., Expert]] = {"StackCube": StackCubeExpert}
+EXPERTS: dict[str, Callable[..., Expert]] = {
+    "StackCube": StackCubeExpert,
+    "PegInsertionSide": PegInsertionSideExpert,
+    "TurnFaucet": TurnFaucetExpert,
+    "TurnFaucetSource": TurnFaucetExpert,
+}
 
 
 def scripted_episodes(
@@ -125,6 +140,8 @@ def _successful_episodes(
 ) -> Iterator[dict[str, Any]]:
     task, expert = get_task(task_name), EXPERTS[task_name](noise)
     sim = task.make()
+    if isinstance(expert, Watching):
+        expert.watch(sim)
     try:
         kept, seed, failures = 0, first_seed, 0
         while kept < num:

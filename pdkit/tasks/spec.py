@@ -43,6 +43,7 @@ class TaskSpec:
     summary: str = ""  # one sentence for people
     joints: int = 0  # the first so many numbers of an observation are the robot's joint positions
     rate: float = 1.0  # primitive steps a second
+    demo_task: str = ""  # the task whose demonstrations are imitated, where it is another (other objects, same numbers)
     held_actions: tuple[int, ...] = ()  # where actions are not targets: the dimensions that are all the same, such as a gripper's
 
     def resting(self, action: np.ndarray) -> np.ndarray:
