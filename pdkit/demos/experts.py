@@ -12,6 +12,7 @@ import numpy as np
 
 from ..errors import PdkitError, unknown
 from ..tasks import get_task
+from .chair_expert import PushChairExpert
 
 GIVE_UP = 50  # failures in a row after which a scripted expert is not worth waiting for
 
@@ -93,7 +94,9 @@ class StackCubeExpert:
         return tool, 0, self.OPEN
 
 
-EXPERTS: dict[str, Callable[..., Expert]] = {"StackCube": StackCubeExpert}
+EXPERTS: dict[str, Callable[..., Expert]] = {
+    "StackCube": StackCubeExpert, "PushChair": PushChairExpert, "PushChairSource": PushChairExpert,
+}
 
 
 def scripted_episodes(

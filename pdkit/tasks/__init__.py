@@ -3,10 +3,11 @@ from __future__ import annotations
 
 from ..errors import unknown
 from .adroit import ADROIT_TASKS
+from .chair import CHAIR_TASKS
 from .maniskill import MANISKILL_TASKS
 from .spec import Sim, TaskSpec
 
-TASKS: dict[str, TaskSpec] = {spec.name: spec for spec in (*MANISKILL_TASKS, *ADROIT_TASKS)}
+TASKS: dict[str, TaskSpec] = {spec.name: spec for spec in (*MANISKILL_TASKS, *CHAIR_TASKS, *ADROIT_TASKS)}
 
 
 def get_task(name: str) -> TaskSpec:
