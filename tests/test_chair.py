@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import json
 import platform
+import re
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from pdkit.tasks.chair import PushChair, make_chair_env
 from pdkit.tasks.chair_assets import Chair, chairs, generated_chair
 from pdkit.tasks.chair_body import chair_start, solved
 from pdkit.tasks.partnet import UrdfWriter, link_parts
+from pdkit.video import try_render
 
 SAME_BITS = platform.machine() in ("x86_64", "AMD64")  # elsewhere a compiler may fuse operations
 QPOS, QVEL, BASE, BASE_VEL = slice(0, 19), slice(19, 38), slice(38, 41), slice(41, 44)
@@ -81,6 +83,17 @@ def test_every_number_of_a_first_observation(fast):
             assert np.linalg.norm(hand[0] - hand[1]) == pytest.approx(0.04, abs=1e-5)  # each finger is 2 cm from the middle
             aside = hand.mean(axis=0)[:2] - start.base[:2]
             assert side * (np.cos(start.base[2]) * aside[1] - np.sin(start.base[2]) * aside[0]) > 0.3  # on its side of the robot
+
+
+def test_fingers_come_in_maniskill_2s_order(fast):
+    observation = play(fast, 0, np.random.default_rng(0).uniform(-1, 1, (5, 20)))[0][-1]
+    links = {name: link._objs[0] for name, link in fast._env.agent.robot.links_map.items()}
+    for index, name in enumerate(("right_panda_right", "right_panda_left", "left_panda_right", "left_panda_left")):
+        pose = links[f"{name}finger"].entity_pose
+        tip = pose.p + 0.035 * pose.to_transformation_matrix()[:3, 2]  # 3.5 cm along the finger
+        np.testing.assert_allclose(observation[TIPS].reshape(4, 3)[index], tip, atol=1e-5)
+    for index, name in enumerate(("right_panda_left", "right_panda_right", "left_panda_left", "left_panda_right")):
+        np.testing.assert_array_equal(observation[FINGERS].reshape(4, 3)[index], links[f"{name}finger"].linear_velocity)
 
 
 @pytest.mark.parametrize(("index", "velocity"), [
@@ -156,6 +169,18 @@ def test_simulations_in_one_process_do_not_disturb_each_other():
         np.testing.assert_array_equal(np.stack(history), play(PushChair(kind), seed, actions)[0])
 
 
+def test_other_tasks_do_not_disturb(fast):
+    actions = pushing(fast, 1, steps=30)
+    alone = play(fast, 1, actions)[0]
+    cube = get_task("StackCube").make()  # sets PhysX's global configuration to its own
+    cube.reset(0)
+    history = [fast.reset(1)]
+    for action in actions:
+        cube.step(action[:4])
+        history.append(fast.step(action)[0])
+    np.testing.assert_array_equal(np.stack(history), alone)
+
+
 # ---- success -----------------------------------------------------------------------------------------------------------
 
 def turned(axis: str, degrees: float) -> np.ndarray:
@@ -221,6 +246,15 @@ def test_every_chair_stands_by_itself_on_its_wheels(kind):
         assert np.abs(observations[-1, 48:50]).max() < 0.02 and np.abs(observations[-1, MOTION]).max() < 0.01
 
 
+def test_wheels_grip_and_seats_do_not_touch_their_feet(fast):
+    fast.reset(0)
+    links = {name: link._objs[0] for name, link in fast._env.chair.links_map.items()}
+    for name, link in links.items():
+        for shape in link.collision_shapes:
+            assert shape.physical_material.dynamic_friction == pytest.approx(1.0 if name.startswith("wheel") else 0.1)
+            assert bool(shape.collision_groups[2] & 1 << 31) == (name in ("seat", "support"))
+
+
 def test_starts_are_maniskill_2s():
     starts = [chair_start(seed, 5) for seed in range(400)]
     far = [np.linalg.norm(start.place) for start in starts]
@@ -265,9 +299,27 @@ def test_frictions_are_drawn_for_every_episode_and_repeat(fast):
     np.testing.assert_array_equal(joints(fast, seeds[0]), values[0])
 
 
-def test_pictures_are_refused_clearly():
-    with pytest.raises(PdkitError, match="no pictures"):
-        PushChair("source", render=True)
+def test_plans_show_chair_robot_and_target(fast):
+    with pytest.raises(PdkitError, match="render=True"):
+        fast.render()
+    sim = PushChair("source", render=True)
+    observation = sim.reset(0)
+    picture = sim.render()
+    assert picture.shape == (256, 256, 3) and picture.dtype == np.uint8
+    assert try_render(get_task("PushChair")) is None  # wherever there is matplotlib
+
+    def colour(place, along=0.0, angle=0.0):
+        """The colour of the plan's pixel at a place on the floor, or so many metres from it."""
+        x, y = place + along * np.array([np.cos(angle), np.sin(angle)])
+        return picture[round(128 - y * 256 / 4.8), round(128 + x * 256 / 4.8)].astype(int)
+
+    red, blue, grey = colour((0, 0)), colour(observation[44:46]), colour(observation[38:40])
+    assert red[0] > red[2] + 50 and blue[2] > blue[0] + 50 and np.ptp(grey) < 10 and grey[0] < 130
+    facing = chair_start(0, 5).facing
+    assert colour(observation[44:46], -0.18, facing).sum() < colour(observation[44:46], 0.12, facing).sum()  # the dark back is behind
+    before = picture
+    sim.step(np.eye(20)[0])
+    assert np.abs(sim.render().astype(int) - before).max() > 50
 
 
 # ---- the user's own PartNet-Mobility -----------------------------------------------------------------------------------
@@ -301,6 +353,31 @@ def test_partnet_chairs_take_the_place_of_generated_ones(partnet):
         seat = sim._env.chair.links_map["seat"]._objs[0].entity_pose.to_transformation_matrix()
         faces = np.arctan2(seat[1, 0], seat[0, 0]) - np.pi / 2
         assert wrapped(faces - start.facing) == pytest.approx(0, abs=1e-5)
+
+
+CUBE = "\n".join([*(f"v {x} {y} {z}" for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)), "f 1 2 4 3", "f 5 7 8 6", "f 1 5 6 2",
+                  "f 3 4 8 7", "f 1 3 7 5", "f 2 6 8 4", ""])
+
+
+def test_partnet_meshes_take_part(partnet):
+    """A box of the seat written as PartNet writes shapes, as a mesh beside the description, weighs and collides as the box does."""
+    folder, _ = partnet
+    path = folder / "3003" / "mobility.urdf"
+    boxes = path.read_text()
+    size = re.search(r'"seat-\d+"><origin[^>]*/><geometry><box size="([^"]*)"', boxes)[1]
+    half = " ".join(str(float(edge) / 2) for edge in size.split())
+    (path.parent / "textured_objs").mkdir()
+    (path.parent / "textured_objs" / "original-1.obj").write_text(CUBE)
+    path.write_text(boxes.replace(f'<box size="{size}" />', f'<mesh filename="textured_objs/original-1.obj" scale="{half}" />'))
+    mesh = chairs("novel")[0]
+    assert "original-1.obj" in mesh.model.urdf and "original-1.obj" not in boxes
+    seats = []
+    for chair in (mesh, Chair(generated_chair(25))):
+        env = make_chair_env([chair])
+        seats.append(env.chair.links_map["seat"]._objs[0])
+        assert len(seats[-1].collision_shapes) == boxes.count('<collision name="seat-')
+    assert seats[0].mass == pytest.approx(seats[1].mass, rel=1e-3) and seats[0].mass > 1
+    np.testing.assert_allclose(seats[0].compute_global_aabb_tight()[1][2], seats[1].compute_global_aabb_tight()[1][2] + 0.002, atol=1e-3)
 
 
 def test_incomplete_partnet_folders_are_told(partnet, monkeypatch):

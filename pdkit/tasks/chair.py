@@ -18,6 +18,7 @@ import numpy as np
 from ..errors import PdkitError
 from .chair_assets import Chair, chairs
 from .chair_body import HZ, chair_start, solved
+from .chair_plan import plan
 from .maniskill import renew_physics
 from .maniskill_headless import make_env, quiet
 from .mobile_panda import CONTROL, MobilePanda
@@ -35,8 +36,7 @@ class PushChair:
     """The fast step; see `Sim` for the methods. `kind` is "source" or "novel"; a chair's scene is built when first needed."""
 
     def __init__(self, kind: str, render: bool = False):
-        if render:
-            raise PdkitError("PushChair has no pictures; make it without render=True.")
+        self._can_render = render
         self._chairs = chairs(kind)
         self._scenes: dict[int, tuple[Any, MobilePanda]] = {}
 
@@ -60,7 +60,14 @@ class PushChair:
         return self._observe(), solved(before, self._chair.root)
 
     def _observe(self) -> np.ndarray:
-        return np.concatenate([*self._panda.proprioception(), self._chair.state(), *self._panda.fingers()], dtype=np.float32)
+        parts = [*self._panda.proprioception(), self._chair.state(), *self._panda.fingers()]
+        self._last = np.concatenate(parts, dtype=np.float32)
+        return self._last.copy()
+
+    def render(self) -> np.ndarray:
+        if not self._can_render:
+            raise PdkitError("This simulation was made without pictures; make it with render=True to draw it.")
+        return plan(self._last)
 
     def close(self) -> None:
         for env, _ in self._scenes.values():
@@ -79,6 +86,7 @@ _COMMON = dict(
     absolute_actions=False,
     joints=19,
     rate=float(HZ),
+    plan_view=True,
 )
 CHAIR_TASKS = (
     TaskSpec(name="PushChair", make=partial(PushChair, "novel"), **_COMMON,

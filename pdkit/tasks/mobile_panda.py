@@ -69,8 +69,6 @@ class MobilePanda:
         self.robot.set_qpos(positions)
         self.robot.set_qvel(still)
         self.robot.set_qf(still)
-        self.robot.root.put_to_sleep()  # as maniskill.place_body does, and for the same reason
-        self.robot.root.wake_up()
 
     def drive(self, action: np.ndarray) -> None:
         """Set the joints' targets for an action (20,), clipped to [-1, 1]."""
