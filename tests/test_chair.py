@@ -4,17 +4,21 @@ from __future__ import annotations
 import json
 import platform
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from pdkit.demos import save_demos, sources
 from pdkit.demos.chair_expert import PushChairExpert
+from pdkit.demos.experts import scripted_episodes
 from pdkit.errors import PdkitError
 from pdkit.tasks import chair_assets, get_task
 from pdkit.tasks.chair import PushChair, make_chair_env
 from pdkit.tasks.chair_assets import Chair, chairs, generated_chair
 from pdkit.tasks.chair_body import chair_start, solved
 from pdkit.tasks.partnet import UrdfWriter, link_parts
+from pdkit.train import base_demos
 from pdkit.video import try_render
 
 SAME_BITS = platform.machine() in ("x86_64", "AMD64")  # elsewhere a compiler may fuse operations
@@ -436,11 +440,19 @@ def test_parts_are_read_from_a_description():
 
 @pytest.mark.parametrize(("name", "noise"), [("PushChairSource", 0.0), ("PushChair", 0.1)])
 def test_expert_pushes_chairs_home(name, noise):
-    from pdkit.demos.experts import scripted_episodes
-
     episodes = list(scripted_episodes(name, 4, first_seed=100, noise=noise))
     assert episodes[-1]["seed"] <= 104  # at most one of five failed
     for episode in episodes:
         assert 60 < len(episode["actions"]) < 200 and np.abs(episode["actions"]).max() <= 1
         assert np.linalg.norm(episode["observations"][-1][44:46]) < 0.15 < np.linalg.norm(episode["observations"][-20][44:46])
         assert episode["actions"][:, :3].std(axis=0).min() > 0.01 and not episode["actions"][:, 3:].any()
+
+
+def test_novel_chairs_are_learned_from_demonstrations_of_the_source_ones(tmp_path):
+    def arguments(task):
+        return SimpleNamespace(task=task, demos=str(tmp_path / "demos.safetensors"), num_demos=None)
+
+    save_demos(sources.scripted("PushChairSource", 2), arguments("").demos)
+    assert base_demos(arguments("PushChair")).num == base_demos(arguments("PushChairSource")).num == 2
+    with pytest.raises(PdkitError, match="demonstrations of PushChairSource, not of StackCube"):
+        base_demos(arguments("StackCube"))

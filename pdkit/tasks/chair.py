@@ -89,7 +89,7 @@ _COMMON = dict(
     plan_view=True,
 )
 CHAIR_TASKS = (
-    TaskSpec(name="PushChair", make=partial(PushChair, "novel"), **_COMMON,
+    TaskSpec(name="PushChair", make=partial(PushChair, "novel"), demo_task="PushChairSource", **_COMMON,
              summary="A robot with two arms must push a swivel chair that its demonstrations never showed to the middle of the room."),
     TaskSpec(name="PushChairSource", make=partial(PushChair, "source"), **_COMMON,
              summary="PushChair with the chairs of the demonstrations."),

@@ -43,4 +43,5 @@ class TaskSpec:
     summary: str = ""  # one sentence for people
     joints: int = 0  # the first so many numbers of an observation are the robot's joint positions
     rate: float = 1.0  # primitive steps a second
+    demo_task: str = ""  # the task whose demonstrations are imitated, where it is another (other objects, same numbers)
     plan_view: bool = False  # pictures are plans of the floor that the task draws itself, without a graphics driver
