@@ -66,8 +66,8 @@ class ChairBody:
             raise PdkitError(f"Chair {chair.model.name} has {len(self._joints)} joints where {len(chair.joints) or f'at most {ROOM}'} are "
                              "expected; put PartNet-Mobility's own description in its place.")
         self._rest = np.array(chair.joints or np.zeros(len(self._joints)), np.float32)
-        self._position, self._turn = np.array(chair.position), np.array(chair.rotation)
-        articulation.set_root_pose(sapien.Pose(self._position, self._turn))
+        self._height, self._rest_turn = chair.position[2], sapien.Pose(q=chair.rotation)
+        articulation.set_root_pose(sapien.Pose(chair.position, chair.rotation))
         articulation.set_qpos(self._rest)
         # PartNet's seats look along their -y once the Euler angles about x and y are taken off (ManiSkill 2).
         forward = seat.entity_pose.to_transformation_matrix()
@@ -76,9 +76,9 @@ class ChairBody:
     def place(self, start: Start) -> None:
         """Put the chair, at rest, where an episode begins, with that episode's frictions."""
         half = (start.facing - self._facing) / 2
-        pose = self._pose([*start.place, self._position[2]], _product((np.cos(half), 0, 0, np.sin(half)), self._turn))
+        turned = self._pose([*start.place, self._height], [np.cos(half), 0, 0, np.sin(half)])
         body, none = self._articulation, np.zeros(3, np.float32)
-        body.set_root_pose(pose)
+        body.set_root_pose(turned * self._rest_turn)
         body.set_qpos(self._rest)
         body.set_root_linear_velocity(none)
         body.set_root_angular_velocity(none)
@@ -106,12 +106,6 @@ class ChairBody:
         state[7:10], state[10:13] = root.linear_velocity, root.angular_velocity
         state[13 : 13 + count], state[13 + ROOM : 13 + ROOM + count] = body.qpos, body.qvel
         return state
-
-
-def _product(first: tuple[float, ...], second: np.ndarray) -> np.ndarray:
-    """The quaternion of turning by `second`, then by `first`."""
-    a, u, b, v = first[0], np.array(first[1:]), second[0], second[1:]
-    return np.concatenate([[a * b - u @ v], a * v + b * u + np.cross(u, v)])
 
 
 def solved(before: tuple[np.ndarray, np.ndarray], now: tuple[np.ndarray, np.ndarray]) -> bool:
