@@ -81,6 +81,8 @@ def try_render(spec: TaskSpec) -> str | None:
     """
     if os.environ.get(SWITCH, "").lower() in ("off", "0", "no"):
         return f"Pictures are turned off ({SWITCH}=off); everything else runs the same."
+    if spec.plan_view:
+        return None
     return _try_mujoco() if spec.suite == "adroit" else _try_sapien()
 
 

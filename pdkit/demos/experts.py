@@ -12,6 +12,7 @@ import numpy as np
 
 from ..errors import PdkitError, unknown
 from ..tasks import get_task
+from .chair_expert import PushChairExpert
 from .faucet_expert import TurnFaucetExpert
 from .peg_expert import PegInsertionSideExpert
 
@@ -108,6 +109,8 @@ EXPERTS: dict[str, Callable[..., Expert]] = {
     "PegInsertionSide": PegInsertionSideExpert,
     "TurnFaucet": TurnFaucetExpert,
     "TurnFaucetSource": TurnFaucetExpert,
+    "PushChair": PushChairExpert,
+    "PushChairSource": PushChairExpert,
 }
 
 

@@ -44,6 +44,7 @@ class TaskSpec:
     joints: int = 0  # the first so many numbers of an observation are the robot's joint positions
     rate: float = 1.0  # primitive steps a second
     demo_task: str = ""  # the task whose demonstrations are imitated, where it is another (other objects, same numbers)
+    plan_view: bool = False  # pictures are plans of the floor that the task draws itself, without a graphics driver
     held_actions: tuple[int, ...] = ()  # where actions are not targets: the dimensions that are all the same, such as a gripper's
 
     def resting(self, action: np.ndarray) -> np.ndarray:

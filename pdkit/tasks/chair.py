@@ -1,0 +1,97 @@
+"""PushChair: a robot with two arms on a rolling base pushes a swivel chair to the origin and leaves it standing there.
+
+ManiSkill 3 does not have this task of the paper; here it is after ManiSkill 2. ManiSkill 3 builds the scenes (`chair_env.py`) and
+this drives them without torch, as `maniskill.py` does for StackCube.
+
+An observation (131,): the robot's joint positions and velocities (19 each: height, then right arm 7 + 2 fingers, left arm 7 + 2),
+the base's x, y and heading and their velocities (6); of the chair's root link the place, quaternion, velocity and angular velocity
+(13), then its joint positions and velocities (25 each, zeros after as many as the chair has); finger tips and fingers' velocities
+(12 each). Metres, radians, seconds, in the world's frame.
+"""
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from ..errors import PdkitError
+from .chair_assets import Chair, chairs
+from .chair_body import HZ, chair_start, solved
+from .chair_plan import plan
+from .maniskill import renew_physics
+from .maniskill_headless import make_env, quiet
+from .mobile_panda import CONTROL, MobilePanda
+from .spec import TaskSpec
+
+
+def make_chair_env(selection: list[Chair]) -> Any:
+    """The stock ManiSkill environment in which every episode has one of the chairs."""
+    with quiet():
+        from . import chair_env  # registers it
+    return make_env(chair_env.NAME, CONTROL, chairs=selection)
+
+
+class PushChair:
+    """The fast step; see `Sim` for the methods. `kind` is "source" or "novel"; a chair's scene is built when first needed."""
+
+    def __init__(self, kind: str, render: bool = False):
+        self._can_render = render
+        self._chairs = chairs(kind)
+        self._scenes: dict[int, tuple[Any, MobilePanda]] = {}
+
+    def reset(self, seed: int) -> np.ndarray:
+        start = chair_start(seed, len(self._chairs))
+        if start.chair not in self._scenes:
+            env = make_chair_env([self._chairs[start.chair]])
+            self._scenes[start.chair] = env, MobilePanda(env)
+        self._env, self._panda = self._scenes[start.chair]
+        self._chair = self._env.body
+        self._physics = renew_physics(self._env)
+        self._panda.place(start.base)
+        self._chair.place(start)
+        return self._observe()
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, bool]:
+        before = self._chair.root
+        self._panda.drive(action)
+        for _ in range(self._env._sim_steps_per_control):
+            self._physics.step()
+        return self._observe(), solved(before, self._chair.root)
+
+    def _observe(self) -> np.ndarray:
+        parts = [*self._panda.proprioception(), self._chair.state(), *self._panda.fingers()]
+        self._last = np.concatenate(parts, dtype=np.float32)
+        return self._last.copy()
+
+    def render(self) -> np.ndarray:
+        if not self._can_render:
+            raise PdkitError("This simulation was made without pictures; make it with render=True to draw it.")
+        return plan(self._last)
+
+    def close(self) -> None:
+        for env, _ in self._scenes.values():
+            env.close()
+
+
+_COMMON = dict(
+    suite="maniskill",
+    obs_dim=131,
+    act_dim=20,
+    max_episode_steps=200,
+    control=f"{CONTROL}: velocities of the base (forwards, left, turning: 0.5 m/s and 3.14 rad/s; rising: 0.5 m/s), then for the left "
+    "and the right arm seven joint velocities (3.14 rad/s) and the opening of the fingers (-1 closed, 1 open), 20 Hz",
+    success_rule="the chair is less than 0.15 m from the origin, less than 9 degrees off upright, and moved at most 0.1 m/s and turned at "
+    "most 36 degrees a second within the step",
+    absolute_actions=False,
+    joints=19,
+    rate=float(HZ),
+    plan_view=True,
+    held_actions=(11, 19),
+)
+CHAIR_TASKS = (
+    TaskSpec(name="PushChair", make=partial(PushChair, "novel"), demo_task="PushChairSource", **_COMMON,
+             summary="A robot with two arms must push a swivel chair that its demonstrations never showed to the middle of the room."),
+    TaskSpec(name="PushChairSource", make=partial(PushChair, "source"), **_COMMON,
+             summary="PushChair with the chairs of the demonstrations."),
+)

@@ -1,0 +1,151 @@
+"""PushChair as a stock ManiSkill 3 environment: the dual-arm mobile Panda, the floor, one swivel chair.
+
+ManiSkill 3 has no PushChair. This one follows ManiSkill 2 (`mani_skill2/envs/ms1/push_chair.py`, `agents/robots/mobile_panda.py`)
+with the rule for "static" of the paper's PushChair-v2. The robot's description is the one in mani-skill's wheel. `chair.py` drives
+the same scene without torch. Importing this module imports ManiSkill.
+"""
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import sapien
+import torch
+from mani_skill import PACKAGE_ASSET_DIR
+from mani_skill.agents.base_agent import BaseAgent
+from mani_skill.agents.controllers import PDBaseVelControllerConfig, PDJointPosMimicControllerConfig, PDJointVelControllerConfig
+from mani_skill.agents.registration import register_agent
+from mani_skill.envs.sapien_env import BaseEnv
+from mani_skill.utils.building.ground import build_ground
+from mani_skill.utils.geometry.rotation_conversions import quaternion_to_axis_angle
+from mani_skill.utils.registration import register_env
+from mani_skill.utils.structs.types import DefaultMaterialsConfig, SceneConfig, SimConfig
+
+from ..errors import PdkitError
+from .chair_assets import SCALE, Chair
+from .chair_body import CLOSE, HZ, STILL, UPRIGHT, ChairBody, chair_start
+from .maniskill_headless import without_materials
+from .mobile_panda import ACTING, ARM_REST, BASE_JOINTS, CONTROL, FINGERS, JOINTS, SIDES, TIPS, arm_joints, finger_joints, joint_order
+from .partnet import link_parts
+
+NAME = "PdkitPushChair-v1"
+TORSO, SEAT = 30, 31  # bits of collision groups that ignore each other: torso and floor, seat and foot
+
+
+@register_agent()
+class MobilePandaDualArm(BaseAgent):
+    """Two Panda arms on a torso that rolls in any direction, turns and rises; every joint but the fingers is velocity-controlled."""
+
+    uid = "pdkit_mobile_panda_dual_arm"
+    urdf_path = f"{PACKAGE_ASSET_DIR}/robots/panda/mobile_panda_dual_arm.urdf"
+    disable_self_collisions = True
+    urdf_config = dict(
+        _materials=dict(gripper=dict(static_friction=2.0, dynamic_friction=2.0, restitution=0.0)),
+        link={f"{side}_panda_{finger}finger": dict(material="gripper", patch_radius=0.1, min_patch_radius=0.1)
+              for side in SIDES for finger in ("left", "right")},
+    )
+
+    @property
+    def _controller_configs(self) -> dict[str, Any]:
+        reach = [0.5, 0.5, 3.14, 0.5]
+        parts = dict(base=PDBaseVelControllerConfig(
+            list(BASE_JOINTS), lower=[-value for value in reach], upper=reach, damping=1000, force_limit=500))
+        for side in ACTING:
+            first, second = finger_joints(side)
+            parts[f"{side}_arm"] = PDJointVelControllerConfig(arm_joints(side), lower=-3.14, upper=3.14, damping=100, force_limit=100)
+            parts[f"{side}_gripper"] = PDJointPosMimicControllerConfig(
+                [first, second], lower=-0.01, upper=0.04, stiffness=1e3, damping=1e2, force_limit=100, mimic={second: dict(joint=first)})
+        return {CONTROL: parts}
+
+
+@register_env(NAME, max_episode_steps=200)
+class PushChairEnv(BaseEnv):
+    """Push the chair to the origin. A reset builds the scene anew, with the chair that the seed picks out of `chairs`."""
+
+    SUPPORTED_ROBOTS = [MobilePandaDualArm.uid]
+    SUPPORTED_REWARD_MODES = ("sparse", "none")
+
+    def __init__(self, *args: Any, chairs: Sequence[Chair], **kwargs: Any):
+        self._chairs = chairs
+        super().__init__(*args, robot_uids=MobilePandaDualArm.uid, reconfiguration_freq=1, **kwargs)
+
+    @property
+    def _default_sim_config(self) -> SimConfig:
+        return SimConfig(
+            sim_freq=100, control_freq=HZ, scene_config=SceneConfig(solver_position_iterations=15),
+            default_materials_config=DefaultMaterialsConfig(static_friction=0.5, dynamic_friction=0.5, restitution=0))
+
+    def _reconfigure(self, options: dict) -> None:
+        with without_materials():
+            super()._reconfigure(options)
+
+    def _load_agent(self, options: dict) -> None:
+        super()._load_agent(options, sapien.Pose())
+        self.agent.robot.links_map["adjustable_body"].set_collision_group_bit(2, TORSO, 1)
+        self._order = joint_order(self.agent.robot)
+
+    def _load_scene(self, options: dict) -> None:
+        build_ground(self.scene).set_collision_group_bit(2, TORSO, 1)  # the torso's box reaches into the floor
+        self._start = chair_start(int(self._episode_seed[0]), len(self._chairs))
+        self._chair = chair = self._chairs[self._start.chair]
+        loader = self.scene.create_urdf_loader()
+        loader.name, loader.scale, loader.fix_root_link, loader.load_multiple_collisions_from_file = "chair", SCALE, False, True
+        loader.set_material(0.1, 0.1, 0)
+        loader.set_density(200)
+        with chair.model.file() as path:
+            builder = loader.parse(path)["articulation_builders"][0]
+        builder.initial_pose = sapien.Pose(chair.position, chair.rotation)
+        self.chair = builder.build(fix_root_link=False)
+        seat = self._prepare_links(link_parts(chair.model.urdf))
+        self.body = ChairBody(self.chair._objs[0], chair, seat)
+
+    def _prepare_links(self, parts: dict[str, str]) -> Any:
+        """Wheels that grip and a seat that does not collide with its foot, as in ManiSkill 2; the seat's link, SAPIEN's."""
+        links = self.chair.links_map
+        if not any("seat" in named for named in parts.values()):
+            raise PdkitError(f"Chair {self._chair.model.name} has no part called seat; put PartNet-Mobility's own description there.")
+        seats = [link for name, link in links.items() if "seat" in parts[name]]
+        feet = [link for name, link in links.items() if "leg" in parts[name] or "foot" in parts[name]]
+        if seats[0] not in feet:
+            for link in (seats[0], *feet):
+                link.set_collision_group_bit(2, SEAT, 1)
+        grip = sapien.physx.PhysxMaterial(1, 1, 0)
+        for name, link in links.items():
+            if "wheel" in parts[name]:
+                for shape in link._objs[0].collision_shapes:
+                    shape.physical_material = grip
+        return seats[0]._objs[0]
+
+    def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
+        self.body.place(self._start)
+        positions = np.empty(len(JOINTS), np.float32)
+        positions[self._order] = [*self._start.base, *ARM_REST, *ARM_REST]
+        self.agent.reset(positions)
+        self._now = self.chair.pose
+
+    def evaluate(self) -> dict[str, torch.Tensor]:
+        """Judges a step: the chair's motion is measured from one call to the next, so call it once a step as `step` does."""
+        before, self._now = self._now, self.chair.pose
+        tilt = torch.arccos(self._now.to_transformation_matrix()[:, 2, 2].clip(-1, 1))
+        moved = torch.linalg.norm(self._now.p - before.p, dim=1)
+        turned = torch.linalg.norm(quaternion_to_axis_angle((before.inv() * self._now).q), dim=1)
+        turned = torch.minimum(turned, 2 * torch.pi - turned)
+        verdicts = dict(
+            chair_close=torch.linalg.norm(self._now.p[:, :2], dim=1) < CLOSE,
+            chair_standing=tilt < UPRIGHT,
+            chair_static=(moved <= STILL[0] / HZ) & (turned <= STILL[1] / HZ),
+        )
+        return verdicts | dict(success=torch.stack(list(verdicts.values())).all(dim=0))
+
+    def _get_obs_agent(self) -> dict[str, torch.Tensor]:
+        qpos, qvel = self.agent.robot.qpos[:, self._order], self.agent.robot.qvel[:, self._order]
+        return dict(qpos=qpos[:, 3:], qvel=qvel[:, 3:], base=qpos[:, :3], base_velocity=qvel[:, :3])
+
+    def _get_obs_extra(self, info: dict) -> dict[str, torch.Tensor]:
+        robot = self.agent.robot
+        tips = [(robot.joints_map[f"{side}_panda_{name}"]._objs[0].global_pose * sapien.Pose([0, along, 0])).p
+                for side in SIDES for name, along in TIPS]
+        fingers = [robot.links_map[name].linear_velocity for name in FINGERS]
+        return dict(chair=torch.from_numpy(self.body.state())[None], finger_places=torch.tensor(np.concatenate(tips))[None],
+                    finger_velocities=torch.cat(fingers, dim=1))
