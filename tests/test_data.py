@@ -11,7 +11,7 @@ from pdkit.policies import load_policy
 from pdkit.profiles import online_config
 from pdkit.tasks import get_task
 
-ADROIT = ["Door", "Hammer", "Pen"]
+ADROIT = ["Door", "Hammer", "Pen", "Relocate"]
 SHIPPED = [*ADROIT, "StackCube"]
 
 
