@@ -17,7 +17,7 @@ from .errors import PdkitError, unknown
 from .files import ROOT
 
 VERBS = {  # verb: (what it does, the function that does it, given the remaining arguments)
-    "run": ("the main job: a base policy, decorated by online RL, on Adroit Door", "pdkit.main_job:main"),
+    "run": ("the main job: a base policy, decorated by online RL, on Adroit Door or another task", "pdkit.main_job:main"),
     "test": ("pass the tests (further arguments go to pytest; --slow adds those that take minutes)", "pdkit.cli:test"),
     "lab": ("open the notebooks in JupyterLab", "pdkit.cli:lab"),
     "doctor": ("check this machine, with the fix beside each problem", "pdkit.doctor:main"),

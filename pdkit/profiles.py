@@ -44,7 +44,13 @@ _LESSON_TASK: dict[str, dict[str, Any]] = {
     "StackCube": dict(alpha=0.1, alpha_scale=(1.0, 1.0, 1.0, 10.0), H=40_000, total_steps=60_000, utd=0.35, gamma=0.98, actor_lr=3e-4,
                       critic_lr=3e-4, train_limit=100, eval_every=5_000, eval_episodes=100, demo_fraction=0.5,
                       on_success="terminate", success_tail=0, target_entropy_scale=3.0),
-    "Pen": dict(total_steps=20_000, H=10_000),
+    # The bound is a little above the base's error on its demonstrations (0.1, rms, their noise taken off); the slowest of these
+    # succeeds at step 81.
+    "Pen": dict(alpha=0.15, H=15_000, total_steps=40_000, train_limit=100, eval_every=10_000),
+    # The bound as for Pen (the base is off by 0.12); half the steps already solved every selection episode, as a nail stays driven.
+    "Hammer": dict(alpha=0.15, H=15_000, total_steps=30_000, train_limit=120),
+    # The base is off by 0.08, so Door's bound does; success on selection episodes still rose over the last 10,000 steps, 88 to 98 %.
+    "Relocate": dict(alpha=0.1, H=20_000, total_steps=50_000, train_limit=120, eval_every=10_000),
 }
 _SMOKE: dict[str, Any] = dict(total_steps=600, warmup_steps=200, H=400, num_envs=4, env_workers=0, eval_workers=0, utd=0.1, batch=64,
                               eval_every=600, eval_episodes=2, log_every=200, checkpoint_every=300, hidden=32,

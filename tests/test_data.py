@@ -8,9 +8,11 @@ from pdkit.demos import load_demos
 from pdkit.doctor import data_files
 from pdkit.files import DATA, read_json, sha256
 from pdkit.policies import load_policy
+from pdkit.profiles import online_config
 from pdkit.tasks import get_task
 
-SHIPPED = ["Door", "StackCube"]
+ADROIT = ["Door", "Hammer", "Pen", "Relocate"]
+SHIPPED = [*ADROIT, "StackCube"]
 
 
 def test_every_bundled_file_has_the_recorded_checksum():
@@ -24,9 +26,41 @@ def test_the_repository_stays_small():
 @pytest.mark.parametrize("task", SHIPPED)
 def test_demonstrations_load_and_succeed(task):
     demos = load_demos(DATA / "demos" / f"{task}.safetensors")
-    assert demos.label == {"Door": "agent", "StackCube": "scripted"}[task]
+    assert demos.label == ("agent" if task in ADROIT else "scripted")
     assert all(e["success"].any() for e in demos.episodes())
     assert demos.command.startswith("pdkit demos")
+
+
+@pytest.mark.parametrize("task", ADROIT)
+def test_a_recorded_episode_is_what_the_simulator_does(task):
+    """From the recorded seed the recorded actions lead through the recorded states, to the bit."""
+    demos = load_demos(DATA / "demos" / f"{task}.safetensors")
+    episode, sim = demos.episode(0), get_task(task).make()
+    try:
+        states, solved = [sim.reset(int(demos.seeds[0]))], []
+        for action in episode["actions"]:
+            state, success = sim.step(action)
+            states.append(state)
+            solved.append(success)
+    finally:
+        sim.close()
+    assert np.array_equal(np.stack(states), episode["observations"]) and solved == episode["success"].tolist()
+    assert episode["success"].any() and len(episode["actions"]) == solved.index(True) + 1 + demos.extra["tail"]
+
+
+@pytest.mark.parametrize("task", ADROIT)
+def test_the_agent_that_made_the_demonstrations_is_shipped_and_tells_its_origin(task):
+    folder = DATA / "checkpoints" / task / "demonstrator"
+    demos, card = load_demos(DATA / "demos" / f"{task}.safetensors"), read_json(folder / "decorated.json")["info"]
+    assert demos.num == 25 and f"--policy data/checkpoints/{task}/demonstrator" in demos.command
+    assert "DAPG expert" in card["how"] and "Apache-2.0" in card["how"] and card["label"] == "agent"
+    # The actions are the agent's own, but for the noise: the spread between them is the noise's.
+    agent, first = load_decorated(folder), demos.episode(0)
+    padded = np.concatenate([np.repeat(first["observations"][:1], agent.window - 1, axis=0), first["observations"][:-1]])
+    windows = np.stack([padded[i: i + agent.window] for i in range(len(first["actions"]))])
+    meant = agent.act(windows)[:, 0]
+    spread = (first["actions"] - meant)[np.abs(meant) < 0.6]  # nearer to the limits the noise is clipped
+    assert abs(spread.mean()) < 0.01 and spread.std() == pytest.approx(demos.extra["noise"], rel=0.05)
 
 
 @pytest.mark.parametrize("task", SHIPPED)
@@ -40,6 +74,7 @@ def test_checkpoints_load_and_fit_the_task(task):
     # the decorated policy holds the very base policy that is shipped beside it
     for ours, theirs in zip(base.state_dict().values(), decorated.base.state_dict().values(), strict=True):
         assert ours.equal(theirs)
+    assert decorated.config == online_config(task, "lesson").decorator
 
 
 @pytest.mark.parametrize("card", sorted((DATA / "checkpoints").rglob("decorated.json")), ids=lambda path: "-".join(path.parts[-3:-1]))
@@ -60,3 +95,14 @@ def test_the_main_jobs_evidence_has_a_row_a_seed_and_a_command_each():
     assert ((door.decorated_success >= 0.95) & (door.train_minutes <= 5)).sum() >= 4  # what the README promises
     cubes = table[table.task == "StackCube"]
     assert len(cubes) >= 3 and ((cubes.decorated_success >= 0.9) & (cubes.train_minutes <= 20)).all()
+
+
+@pytest.mark.parametrize("task", SHIPPED)
+def test_the_shipped_policies_are_those_of_a_recorded_row(task):
+    table = pd.read_csv(DATA / "results" / "main_job.csv").query("task == @task and recipe == 'lesson'")
+    card = read_json(DATA / "checkpoints" / task / "decorated" / "decorated.json")["info"]
+    row = table[table.seed == card["seed"]].iloc[0]
+    assert (card["command"], card["decorated_success"], card["episodes"]) == (row.command, row.decorated_success, row.episodes)
+    assert row.env_steps >= online_config(task, "lesson").total_steps
+    assert table.base_success.nunique() == 1 and 0.2 <= row.base_success <= 0.8 and (table.episodes == 200).all()
+    assert (table.decorated_success > table.base_success + 0.15).all()

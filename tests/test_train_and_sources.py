@@ -43,7 +43,7 @@ def test_demonstrations_from_the_command_line(monkeypatch, tmp_path, capsys):
 
 @pytest.mark.parametrize("words", [
     ("demos", "Stackcube"), ("demos",), ("demos", "StackCube", "--num", "0"), ("demos", "--show", "none.safetensors"),
-    ("demos", "StackCube", "--source", "human"), ("train", "base", "Door", "--policy", "gan"), ("train", "base", "Pen"),
+    ("demos", "StackCube", "--source", "human"), ("train", "base", "Door", "--policy", "gan"), ("train", "base", "Pens"),
     ("train", "base", "Door", "--num-demos", "99"), ("train", "base", "Door", "--set", "iterrations=3"),
     ("train", "decorated", "Door", "--set", "alpha=7.0"), ("train", "decorated", "Door", "--profile", "x"),
     ("train", "decorated", "Door", "--set", "seed=3"), ("train", "decorated", "Door", "--seeds", "-1"),
@@ -56,6 +56,14 @@ def test_bad_input_is_one_sentence_and_exit_code_2(monkeypatch, capsys, words):
     assert call(monkeypatch, *words) == 2
     out, err = capsys.readouterr()
     assert len(err.strip().splitlines()) == 1 and "Traceback" not in err
+
+
+def test_a_task_without_bundled_demonstrations_is_said_with_those_that_have_some(monkeypatch, tmp_path):
+    (tmp_path / "demos").mkdir()
+    (tmp_path / "demos" / "Door.safetensors").touch()
+    monkeypatch.setattr(sources, "DATA", tmp_path)
+    with pytest.raises(PdkitError, match="No demonstrations of Pen are bundled .there are: Door.*pdkit demos"):
+        sources.bundled("Pen")
 
 
 def test_no_network_is_said_clearly(monkeypatch):
