@@ -75,6 +75,29 @@ def focal_loss(answer: Callable, strict: bool = False) -> bool:
     return _judge("focal_loss", complaints, strict)
 
 
+def ddim_step(answer: Callable, strict: bool = False) -> bool:
+    """03: from noisy actions x (T, act_dim), predicted noise, and abar here and at the next step: the actions at the next step."""
+    def complaints() -> Iterator[str]:
+        generator = torch.Generator().manual_seed(0)
+        x, noise = torch.randn((2, 8, 2), generator=generator)
+        for here, after in ((0.5, 0.9), (0.02, 0.3), (0.8, 1.0)):
+            clean = ((x - (1 - here) ** 0.5 * noise) / here**0.5)
+            expected = after**0.5 * clean.clamp(-1, 1) + (1 - after) ** 0.5 * noise
+            got = torch.as_tensor(np.asarray(answer(x.clone(), noise.clone(), here, after), np.float32))
+            if got.shape != expected.shape:
+                yield f"it gives shape {tuple(got.shape)}, not {tuple(expected.shape)}."
+            elif torch.allclose(got, expected, atol=1e-4):
+                continue
+            elif torch.allclose(got, after**0.5 * clean + (1 - after) ** 0.5 * noise, atol=1e-4):
+                yield "the clean actions leave [-1, 1]: clip them first, or a small error in the noise explodes where abar is small."
+            elif torch.allclose(got, clean.clamp(-1, 1), atol=1e-4):
+                yield "these are the clean actions: put the noise of the next step back in."
+            else:
+                yield f"with abar {here:g} and then {after:g} the first number is {got[0, 0]:.3f}, not {expected[0, 0]:.3f}."
+
+    return _judge("ddim_step", complaints, strict)
+
+
 def gate(answer: Callable, strict: bool = False) -> bool:
     """05: each environment's row kept with probability min(step / H, 1), else zero."""
     def complaints() -> Iterator[str]:

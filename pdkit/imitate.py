@@ -120,15 +120,15 @@ class Average:
 
 
 def imitate(kind: str, demos: Demos, config: ImitateConfig | None = None, policy_config: dict | None = None, *, device: str = "cpu",
-            progress: Callable[[dict], None] | None = None) -> tuple[Policy, list[dict]]:
-    """Train a policy of `kind` on `demos`.
+            progress: Callable[[dict], None] | None = None, spec: TaskSpec | None = None) -> tuple[Policy, list[dict]]:
+    """Train a policy of `kind` on `demos`; `spec` is for worlds outside the registry, such as the probes.
 
     Returns the selected policy in evaluation mode, and one row per checkpoint: iteration, loss terms, seconds and, when
     evaluated, success_once and success_at_end on the selection seeds. A policy without gradient steps, such as VINN, is only
     given the demonstrations: it has a single row, of iteration 0, and of `config` only the evaluation and the windows matter.
     """
     config = config or ImitateConfig(**POLICIES[kind].training)
-    spec = get_task(demos.task)
+    spec = spec or get_task(demos.task)
     torch.manual_seed(config.seed)
     generator = torch.Generator().manual_seed(config.seed)
     policy = POLICIES[kind]({"obs_dim": spec.obs_dim, "act_dim": spec.act_dim, **POLICIES[kind].for_task(spec), **(policy_config or {})})

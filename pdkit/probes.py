@@ -4,6 +4,7 @@
     lever     one decision: the action's sign decides; a wrong sign in the actor's or critic's loss fails
     corridor  success only after several steps: discounting and n-step returns order the values along the way
     reach     a biased base policy misses by less than alpha allows: only the decorator's sum closes the gap
+    fork      demonstrations pass an obstacle on either side: a policy that averages them runs into it
 """
 from __future__ import annotations
 
@@ -73,6 +74,24 @@ class ReachSim:
     def close(self) -> None: ...
 
 
+class ForkSim:
+    """A point starts near the origin and must pass x = 1.9 without touching a disc of radius 0.4 around (1, 0); action: a velocity."""
+
+    CENTRE, RADIUS = np.array([1.0, 0.0]), 0.4
+
+    def reset(self, seed: int) -> np.ndarray:
+        self.position, self.crashed = np.array([0.0, np.random.default_rng(seed).uniform(-0.05, 0.05)]), False
+        return self.position.astype(np.float32)
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, bool]:
+        if not self.crashed:
+            self.position = self.position + 0.25 * np.clip(action, -1, 1)
+            self.crashed = bool(np.linalg.norm(self.position - self.CENTRE) < self.RADIUS)
+        return self.position.astype(np.float32), bool(not self.crashed and self.position[0] > 1.9)
+
+    def close(self) -> None: ...
+
+
 class ProbeBase(Policy):
     """A base policy known exactly. Config: obs_dim, act_dim, kind ("zero", or "reach": towards the goal, missed by `bias`)."""
 
@@ -100,7 +119,8 @@ def _probe(name: str, sim, obs_dim: int, act_dim: int, limit: int) -> TaskSpec:
 
 
 PROBES = {spec.name: spec for spec in (_probe("wait", WaitSim, 1, 1, 5), _probe("lever", LeverSim, 1, 1, 1),
-                                      _probe("corridor", CorridorSim, 1, 1, 20), _probe("reach", ReachSim, 4, 2, 25))}
+                                      _probe("corridor", CorridorSim, 1, 1, 20), _probe("reach", ReachSim, 4, 2, 25),
+                                      _probe("fork", ForkSim, 2, 2, 16))}
 
 
 def zero_base(spec: TaskSpec) -> ProbeBase:

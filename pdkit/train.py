@@ -28,7 +28,7 @@ from .online import Trainer
 from .online_config import OnlineConfig
 from .policies import POLICIES, Policy, load_policy, save_policy
 from .policies.base import read_card
-from .profiles import PROFILES, checked, differences, flat
+from .profiles import PROFILES, checked, differences, flat, policy_values
 from .recorded import record
 from .runs import Run, describe_machine, origin
 from .seeds import reported_seeds
@@ -122,7 +122,8 @@ def _decorated(args) -> int:
         raise PdkitError("--episodes must be at least 1 and every seed 0 or more.")
     for seed in args.seeds:
         base = load_policy(base_folder)
-        config = method_config(args.method, args.task, args.profile, seed, **settings)
+        config = method_config(args.method, args.task, args.profile, seed,
+                               **policy_values(args.task, args.profile, base.kind) | settings)
         if args.num_demos is None:
             args.num_demos = _demos_of(base_folder)
         print(f"{args.task}, seed {seed}: " + str(differences(config, args.profile) or "the profile unchanged"), flush=True)

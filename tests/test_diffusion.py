@@ -31,16 +31,17 @@ def alpha_bar(step, steps=100):
 
 
 class Oracle(torch.nn.Module):
-    """Knows the clean actions, so it tells the noise exactly."""
+    """Knows the clean actions, so it tells the noise (or v) exactly."""
 
-    def __init__(self, clean):
+    def __init__(self, clean, v=False):
         super().__init__()
-        self.clean, self.asked = clean, []
+        self.clean, self.v, self.asked = clean, v, []
 
     def forward(self, noisy, steps, condition):
         self.asked.append(int(steps[0]))
         bar = torch.tensor([alpha_bar(int(k)) for k in steps])[:, None, None]
-        return (noisy - bar.sqrt() * self.clean) / (1 - bar).sqrt()
+        noise = (noisy - bar.sqrt() * self.clean) / (1 - bar).sqrt()
+        return bar.sqrt() * noise - (1 - bar).sqrt() * self.clean if self.v else noise
 
 
 def test_the_network_is_told_step_and_observations():
@@ -66,18 +67,24 @@ class Silent(torch.nn.Module):
 
 
 def test_the_loss_is_that_of_the_noise_which_was_added():
-    p, clean = policy(), torch.rand(4, 8, 2) * 2 - 1
-    p.unet = Oracle(clean)
-    assert p.loss(torch.randn(4, 2, 3), clean)["loss"] < 1e-4
+    clean = torch.rand(4, 8, 2) * 2 - 1
+    for prediction, v in (("epsilon", False), ("v_prediction", True)):
+        p = policy(prediction=prediction)
+        p.unet = Oracle(clean, v)
+        assert p.loss(torch.randn(4, 2, 3), clean)["loss"] < 1e-4
+        p.unet = Oracle(clean, not v)
+        assert p.loss(torch.randn(4, 2, 3), clean)["loss"] > 0.1
+    p = policy()
     p.unet = Silent()
     torch.manual_seed(0)
     assert p.loss(torch.randn(500, 2, 3), torch.zeros(500, 8, 2))["loss"] == pytest.approx(1, abs=0.05)
 
 
+@pytest.mark.parametrize("prediction", ["epsilon", "v_prediction"])
 @pytest.mark.parametrize(("sampler", "steps", "asked"), [("ddim", 4, [75, 50, 25, 0]), ("ddpm", 4, list(range(99, -1, -1)))])
-def test_sampling_removes_the_noise_that_the_network_tells(sampler, steps, asked):
-    p, clean = policy(sampler=sampler, sampler_steps=steps), torch.rand(2, 8, 2) * 1.8 - 0.9
-    p.unet = Oracle(clean)
+def test_sampling_removes_the_noise_that_the_network_tells(sampler, steps, asked, prediction):
+    p, clean = policy(sampler=sampler, sampler_steps=steps, prediction=prediction), torch.rand(2, 8, 2) * 1.8 - 0.9
+    p.unet = Oracle(clean, prediction == "v_prediction")
     actions = p.denoise(torch.randn(2, 2, 3), torch.randn(2, 8, 2))
     assert torch.allclose(actions, clean, atol=1e-3) and p.unet.asked == asked
 
@@ -102,8 +109,8 @@ def test_reset_repeats_the_noise_and_disk_keeps_the_policy(tmp_path):
 
 @pytest.mark.parametrize(("changes", "message"), [
     (dict(horizon=7), "multiple of 2"), (dict(chunk=8), "fit between"), (dict(chunk=0), "at least 1"),
-    (dict(dims=[10, 32]), "multiples of"), (dict(sampler="euler"), "Unknown sampler"), (dict(sampler_steps=0), "from 1 to"),
-    (dict(sampler_steps=101), "from 1 to")])
+    (dict(dims=[10, 32]), "multiples of"), (dict(sampler="euler"), "Unknown sampler"), (dict(prediction="x"), "Unknown prediction"),
+    (dict(sampler_steps=0), "from 1 to"), (dict(sampler_steps=101), "from 1 to")])
 def test_settings_that_do_not_fit_are_refused(changes, message):
     with pytest.raises(PdkitError, match=message):
         policy(**changes)

@@ -204,6 +204,12 @@ def test_main_job_runs_the_notebook_and_sums_up(monkeypatch, tmp_path, capsys):
     assert seen["out"] != first
 
 
+def test_diffusion_lesson(tmp_path):
+    result = run("03_diffusion_policy", tmp_path)
+    assert set(result["fork"]) == {"MLP", "BeT", "Diffusion Policy"} and set(result["stack_cube"]) == {"chunk 4, DDIM 4", "DDIM 1"}
+    assert all(0 <= part["low"] <= part["value"] <= part["high"] <= 1 for part in result["fork"].values())
+
+
 def test_interrupting_the_main_job_tells_how_to_go_on(monkeypatch, tmp_path, capsys):
     def run_notebook(name, values, out):
         raise KeyboardInterrupt

@@ -1,8 +1,12 @@
 """Diffusion Policy (Chi et al., 2023) as Policy Decorator trains it (facts.md 2.2): denoise a sequence of actions.
 
-    training   eps ~ N(0, I), step k uniform:  loss = |eps - eps_theta(sqrt(abar_k) a + sqrt(1 - abar_k) eps, k, o)|^2
+    training   eps ~ N(0, I), step k uniform, a_k = sqrt(abar_k) a + sqrt(1 - abar_k) eps:  loss = |eps - eps_theta(a_k, k, o)|^2
     acting     from pure noise, DDIM (few steps, no noise added) or DDPM (all steps) down to a; of the `horizon` actions the `chunk`
                that begin at the latest observation are executed, then the policy looks again
+
+With prediction="v_prediction" (Salimans and Ho, 2022; not in the paper) the network gives v = sqrt(abar_k) eps - sqrt(1 - abar_k) a
+instead, from which both follow. Where all is noise that is the action itself; a network that must give the noise there has to pass
+its own input on through every layer to a high accuracy, which takes it many more gradient steps (lesson 03 shows both).
 
 The sequence begins with the oldest observation of the window, so its first `window - 1` actions lie in the past.
 """
@@ -19,15 +23,16 @@ from .base import Normalizer, Policy
 from .unet import UNet
 
 SAMPLERS = ("ddim", "ddpm")
+PREDICTIONS = ("epsilon", "v_prediction")
 
 
 class DiffusionPolicy(Policy):
     """Config: obs_dim, act_dim, window (observations), horizon (actions predicted), chunk (of them executed), dims, kernel, groups and
-    embed of the U-Net, diffusion_steps of training, sampler ("ddim", "ddpm") and sampler_steps."""
+    embed of the U-Net, diffusion_steps of training, prediction ("epsilon", "v_prediction"), sampler ("ddim", "ddpm") and sampler_steps."""
 
     kind = "diffusion"
     defaults: dict[str, Any] = dict(window=2, horizon=16, chunk=4, dims=[64, 128, 256], kernel=5, groups=8, embed=64, diffusion_steps=100,
-                                    sampler="ddim", sampler_steps=4)
+                                    prediction="epsilon", sampler="ddim", sampler_steps=4)
     training: dict[str, Any] = dict(lr=1e-4, beta1=0.95, weight_decay=1e-6, schedule="cosine", lr_warmup=500, ema_power=0.75)
 
     def __init__(self, config: dict[str, Any]):
@@ -47,8 +52,8 @@ class DiffusionPolicy(Policy):
             raise PdkitError(f"sampler_steps must be from 1 to diffusion_steps ({c['diffusion_steps']}), not {c['sampler_steps']}.")
         self.normalizer = Normalizer(c["obs_dim"])
         self.unet = UNet(c["act_dim"], c["obs_dim"] * self.window, tuple(c["dims"]), c["kernel"], c["groups"], c["embed"])
-        self.noise = _scheduler("ddpm", c["diffusion_steps"])
-        self.sampler = _scheduler(c["sampler"], c["diffusion_steps"])
+        self.noise = _scheduler("ddpm", c)
+        self.sampler = _scheduler(c["sampler"], c)
         self.sampler.set_timesteps(c["sampler_steps"] if c["sampler"] == "ddim" else c["diffusion_steps"])
 
     def fit_statistics(self, observations: np.ndarray, actions: np.ndarray, seed: int = 0) -> None:
@@ -62,7 +67,8 @@ class DiffusionPolicy(Policy):
         noise = torch.randn(actions.shape).to(actions.device)  # drawn on the CPU everywhere: one generator to restore
         steps = torch.randint(self.config["diffusion_steps"], (len(actions),)).to(actions.device)
         predicted = self.unet(self.noise.add_noise(actions, noise, steps), steps, self.condition(windows))
-        return {"loss": F.mse_loss(predicted.float(), noise)}
+        wanted = noise if self.config["prediction"] == "epsilon" else self.noise.get_velocity(actions, noise, steps)
+        return {"loss": F.mse_loss(predicted.float(), wanted)}
 
     def denoise(self, windows: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
         """All actions (N, horizon, act_dim) that pure noise of that shape becomes."""
@@ -80,14 +86,16 @@ class DiffusionPolicy(Policy):
         return [{"params": list(self.parameters()), "weight_decay": weight_decay}]
 
 
-def _scheduler(name: str, steps: int):
-    """The noise schedule of diffusers with the paper's settings. Raises PdkitError for an unknown sampler."""
+def _scheduler(name: str, config: dict[str, Any]):
+    """The noise schedule of diffusers with the paper's settings. Raises PdkitError for an unknown sampler or prediction."""
     from diffusers.schedulers.scheduling_ddim import DDIMScheduler
     from diffusers.schedulers.scheduling_ddpm import DDPMScheduler
 
-    if name not in SAMPLERS:
-        raise unknown("sampler", name, SAMPLERS)
-    settings = dict(num_train_timesteps=steps, beta_schedule="squaredcos_cap_v2", clip_sample=True, prediction_type="epsilon")
+    for field, value, known in (("sampler", name, SAMPLERS), ("prediction", config["prediction"], PREDICTIONS)):
+        if value not in known:
+            raise unknown(field, value, known)
+    settings = dict(num_train_timesteps=config["diffusion_steps"], beta_schedule="squaredcos_cap_v2", clip_sample=True,
+                    prediction_type=config["prediction"])
     # DDIM's few steps begin a step's width below the last (4 of 100: 75, 50, 25, 0), not at the last itself: there next to nothing is
     # left of the actions, and what they were, told from the predicted noise, would be a coin toss for each number.
     return DDIMScheduler(**settings, timestep_spacing="leading") if name == "ddim" else DDPMScheduler(**settings)
