@@ -33,11 +33,12 @@ from .train import decorate
 SCRATCH = "from scratch"
 FAMILIES = {  # how the methods are told apart in a figure: by what learns
     "a small network on a frozen policy": ("policy_decorator", "residual_rl", "jsrl", "fish"),
-    "fine-tuning the policy itself": ("sac_finetune", "rlpd_paper", "calql", "rot"),
+    "fine-tuning the policy itself": ("sac_finetune", "rlpd_paper", "calql", "rot", "dipo"),
     "PPO instead of SAC": ("ppo_decorator", "ppo_residual_rl", "ppo_finetune"),
     SCRATCH: ("sac_from_scratch", "rlpd", "calql_a", "calql_b", "calql_c", "calql_d"),
 }
-STARTS = {"base": "the base policy", "bet-sac": "its twin for fine-tuning", "vinn": "nearest neighbours (VINN)"}
+STARTS = {"base": "the base policy", "bet-sac": "its twin for fine-tuning", "vinn": "nearest neighbours (VINN)",
+          "diffusion": "a Diffusion Policy"}
 LEAST_RATIO = 0.01  # of smoothness: recorded numbers are rounded, and a policy that stands still has none of it
 
 

@@ -29,6 +29,9 @@ _OWN_POLICY = dict(alpha=1.0, alpha_scale=(), H=0, residual_penalty=0.0)
 # many updates a step, bring it near a decorator's run (data/results/leaderboard.csv: updates, train_minutes).
 _TRANSFORMER = dict(batch=64, utd=0.125)
 
+# A U-Net, which also denoises in four steps for every target.
+_DIFFUSION = dict(batch=64, utd=0.125)
+
 # PPO learns from its own policy alone, with the learning rate falling from the start (as in cleanrl) and a spread that starts at 0.6
 # (cleanrl: 1; the lesson's 0.2 is enough for SAC, whose entropy term raises it)
 _ON_POLICY = dict(warmup="policy", warmup_steps=0, demo_fraction=0.0, lr_decay_from=0.0, log_std_range=(-3.0, 2.0))
@@ -101,6 +104,10 @@ METHODS: dict[str, Method] = {
         "Cal-QL on a random GPT", "appendix F.3 (D): GPT from random weights, demonstrations, online SAC",
         changes=_CALQL | dict(demo_fraction=0.0, calql_pretrained=False), lesson=_TRANSFORMER, paper=_CALQL_PAPER, base="bet-sac",
         trainer="pdkit.methods.calql:TransformerCalQL"),
+    "dipo": Method(
+        "DIPO", "Yang et al. 2023; appendix B.4.2, H.2; facts.md 3.7: critics improve stored actions, a Diffusion Policy imitates them",
+        changes=_OWN_POLICY | dict(warmup="policy", demo_fraction=0.0), lesson=_DIFFUSION, base="diffusion",
+        trainer="pdkit.methods.dipo:DIPO"),
     "jsrl": Method(
         "JSRL", "Uchendu et al. 2023; appendix B.5; facts.md 3.4: the base policy begins each episode, a learner from scratch ends it",
         changes=_OWN_POLICY | dict(warmup="uniform", demo_fraction=0.0, select="last"),

@@ -41,6 +41,9 @@ class MethodConfig:
     calql_weight: float = 1.0  # calql: of the conservative term (original)
     calql_scale: float = 10.0  # calql: rewards -1 and 0 count as so much larger ones in that term (original: -5 and 5)
     calql_max_target: bool = True  # calql: the best of the sampled actions in the target (original)
+    dipo_steps: int = 20  # dipo: gradient steps in actions each time they are drawn (the original)
+    dipo_lr: float = 0.03  # dipo: of these steps, by Adam: about how far one moves each number (the original)
+    dipo_norm: float = 0.1  # dipo: norm that a batch's gradient is clipped to, for each number of an action (the original)
     jsrl_episodes: int = 100  # jsrl: episodes of the base policy that give the first horizon (appendix B.5)
     jsrl_step: int = 10  # jsrl: steps that the guide gives up at a time (appendix B.5)
     jsrl_window: int = 3  # jsrl: evaluations in the moving mean (ours; the paper gives none)
@@ -64,5 +67,7 @@ class MethodConfig:
                 or self.calql_scale <= 0:
             raise PdkitError("Cal-QL needs calql_actions and calql_rollouts of 1 or more, calql_offline_updates and calql_weight of 0 or "
                              "more, and calql_scale above 0.")
+        if self.dipo_steps < 1 or min(self.dipo_lr, self.dipo_norm) <= 0:
+            raise PdkitError("DIPO needs dipo_steps of 1 or more, and dipo_lr and dipo_norm above 0.")
         if min(self.jsrl_episodes, self.jsrl_step, self.jsrl_window) < 1 or self.jsrl_tolerance < 0:
             raise PdkitError("JSRL needs jsrl_episodes, jsrl_step and jsrl_window of 1 or more, and jsrl_tolerance of 0 or more.")
