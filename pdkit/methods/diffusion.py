@@ -26,6 +26,9 @@ class FineTuneDiffusion(FineTune):
             raise PdkitError(f"{config.method} executes the policy's own actions from the first step: set alpha=1, alpha_scale=(), H=0 and "
                              "warmup='policy'.")
         super().__init__(config, base, demos, spec)
+        if base.config["late_steps"]:
+            raise PdkitError(f"{config.method} starts from a Diffusion Policy with one network, and this one was fine-tuned by DPPO: take "
+                             "one that was only imitated.")
 
     def _critic_view(self, stored: torch.Tensor) -> torch.Tensor:
         """The last, normalised observation (B, obs_dim) of stored windows."""
