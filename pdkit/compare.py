@@ -20,6 +20,7 @@ from .claims import DECORATOR
 from .demos import sources
 from .errors import PdkitError
 from .methods import METHODS
+from .methods.ppo import OnPolicy
 from .methods.registry import base_folder, get_method, method_config, trainer_of
 from .plots_compare import labelled, over_seeds
 from .policies import load_policy
@@ -33,11 +34,12 @@ from .train import decorate
 SCRATCH = "from scratch"
 FAMILIES = {  # how the methods are told apart in a figure: by what learns
     "a small network on a frozen policy": ("policy_decorator", "residual_rl", "jsrl", "fish"),
-    "fine-tuning the policy itself": ("sac_finetune", "rlpd_paper", "calql", "rot"),
-    "PPO instead of SAC": ("ppo_decorator", "ppo_residual_rl", "ppo_finetune"),
+    "fine-tuning the policy itself": ("sac_finetune", "rlpd_paper", "calql", "rot", "dipo"),
+    "PPO instead of SAC": ("ppo_decorator", "ppo_residual_rl", "ppo_finetune", "dppo"),
     SCRATCH: ("sac_from_scratch", "rlpd", "calql_a", "calql_b", "calql_c", "calql_d"),
 }
-STARTS = {"base": "the base policy", "bet-sac": "its twin for fine-tuning", "vinn": "nearest neighbours (VINN)"}
+STARTS = {"base": "the base policy", "bet-sac": "its twin for fine-tuning", "vinn": "nearest neighbours (VINN)",
+          "diffusion": "a Diffusion Policy"}
 LEAST_RATIO = 0.01  # of smoothness: recorded numbers are rounded, and a policy that stands still has none of it
 
 
@@ -171,7 +173,7 @@ def budgets(table: pd.DataFrame, labels: Mapping[str, str]) -> pd.DataFrame:
     for recipe, label in labelled(table, labels).items():
         method, mine = method_of(recipe), table[table.recipe == recipe]
         config = method_config(method, task, "lesson")
-        m, on_policy = config.method_config, METHODS[method].trainer.startswith("pdkit.methods.ppo")
+        m, on_policy = config.method_config, issubclass(trainer_of(method), OnPolicy)
         batch = m.ppo_rollout * config.num_envs // m.ppo_minibatches if on_policy else config.batch
         demos = f"{config.demo_fraction:.0%} of a batch" if config.demo_fraction else \
             "yes, not in batches" if trainer_of(method).needs_demos else "none"

@@ -41,6 +41,17 @@ class MethodConfig:
     calql_weight: float = 1.0  # calql: of the conservative term (original)
     calql_scale: float = 10.0  # calql: rewards -1 and 0 count as so much larger ones in that term (original: -5 and 5)
     calql_max_target: bool = True  # calql: the best of the sampled actions in the target (original)
+    dipo_steps: int = 20  # dipo: gradient steps in actions each time they are drawn (the original)
+    dipo_lr: float = 0.03  # dipo: of these steps, by Adam: about how far one moves each number (the original)
+    dipo_norm: float = 0.1  # dipo: norm that a batch's gradient is clipped to, for each number of an action (the original)
+    dppo_steps: int = 4  # dppo: denoising steps that are fine-tuned, the last ones (DPPO: 10 of 20, and all 5 where it samples by DDIM)
+    dppo_gamma: float = 0.99  # dppo: discount of the advantage for each step before the last (DPPO, Square)
+    dppo_clip: float = 0.01  # dppo: clipping of the ratio at the last step (DPPO, Square)
+    dppo_clip_first: float = 0.001  # dppo: ... at the noisiest fine-tuned one (DPPO, Square)
+    dppo_clip_rate: float = 3.0  # dppo: of the exponential between them (DPPO, Square)
+    dppo_sample_std: float = 0.1  # dppo: least standard deviation of the noise in a step when acting (DPPO, Square)
+    dppo_log_prob_std: float = 0.1  # dppo: ... when probabilities are computed (DPPO, Square)
+    dppo_value_lr: float = 1e-3  # dppo: of the value function; the policy's is ppo_lr (DPPO, Square)
     jsrl_episodes: int = 100  # jsrl: episodes of the base policy that give the first horizon (appendix B.5)
     jsrl_step: int = 10  # jsrl: steps that the guide gives up at a time (appendix B.5)
     jsrl_window: int = 3  # jsrl: evaluations in the moving mean (ours; the paper gives none)
@@ -64,5 +75,11 @@ class MethodConfig:
                 or self.calql_scale <= 0:
             raise PdkitError("Cal-QL needs calql_actions and calql_rollouts of 1 or more, calql_offline_updates and calql_weight of 0 or "
                              "more, and calql_scale above 0.")
+        if self.dipo_steps < 1 or min(self.dipo_lr, self.dipo_norm) <= 0:
+            raise PdkitError("DIPO needs dipo_steps of 1 or more, and dipo_lr and dipo_norm above 0.")
+        if min(self.dppo_steps, self.dppo_clip_first) <= 0 or self.dppo_clip < self.dppo_clip_first or not 0 < self.dppo_gamma <= 1 \
+                or min(self.dppo_clip_rate, self.dppo_sample_std, self.dppo_log_prob_std, self.dppo_value_lr) <= 0:
+            raise PdkitError("DPPO needs dppo_gamma in (0, 1], dppo_clip_first above 0 and at most dppo_clip, and dppo_steps, "
+                             "dppo_clip_rate, dppo_sample_std, dppo_log_prob_std and dppo_value_lr above 0.")
         if min(self.jsrl_episodes, self.jsrl_step, self.jsrl_window) < 1 or self.jsrl_tolerance < 0:
             raise PdkitError("JSRL needs jsrl_episodes, jsrl_step and jsrl_window of 1 or more, and jsrl_tolerance of 0 or more.")

@@ -24,12 +24,15 @@ from ..rl.sac import SAC
 class FineTune(Trainer):
     """SAC on a `bet-sac` policy. RLPD (the paper's cut-down) is the same with half of each batch from demonstrations."""
 
+    starts_from: type[Policy] = BeTForSAC  # the only kind of base policy that it can tune
+
     def __init__(self, config, base, demos=None, spec=None):
-        if not isinstance(base, BeTForSAC):
-            raise PdkitError(f"Fine-tuning by SAC needs a base policy of kind bet-sac, not {base.kind}: train one with "
-                             "`pdkit train base TASK --policy bet-sac`.")
+        kind = self.starts_from.kind
+        if not isinstance(base, self.starts_from):
+            raise PdkitError(f"{config.method} fine-tunes a base policy of kind {kind}, not {base.kind}: train one with "
+                             f"`pdkit train base TASK --policy {kind}`.")
         self._start_policy = base
-        super().__init__(config, Zero.instead_of(base, base.window), demos, spec)
+        super().__init__(config, Zero.instead_of(base, base.window, base.chunk), demos, spec)
 
     @staticmethod
     def _view(windows: np.ndarray) -> np.ndarray:
@@ -49,8 +52,8 @@ class FineTune(Trainer):
         critics = GPTCritics(backbone, c.decorator.critic_dim(0, self.spec.act_dim), c.sac, c.sac.num_critics)
         return GPTSAC(self.stored_dim, self.spec.act_dim, c.sac, c.decorator, device=c.device, actor=actor, critics=critics)
 
-    def _as_policy(self, actor: BeTForSAC, base: Policy) -> BeTForSAC:
+    def _as_policy(self, actor: Policy, base: Policy) -> Policy:
         return actor
 
-    def save_policy(self, policy: BeTForSAC, folder: Path) -> None:
+    def save_policy(self, policy: Policy, folder: Path) -> None:
         save_policy(policy, folder, {"task": self.config.task, "seed": self.config.seed, "method": self.config.method})

@@ -73,11 +73,11 @@ class OnPolicy(Trainer):
             self.replay.size = self.replay.position = 0
 
     def _store(self, obs, residual, base, result, base_final) -> None:
-        c, (u, log_prob, on) = self.config, self._acted
+        c, (u, *acted) = self.config, self._acted
         reward = decision_reward(c, result.reward) * self.reward_scale
         stop = [stops(c, bool(t), bool(limit)) for t, limit in zip(result.terminated, result.truncated, strict=True)]
         parts = [obs, u, base, reward[:, None], self._view(result.final_windows), base_final, np.where(stop, 0, c.gamma)[:, None],
-                 log_prob, on, result.done[:, None]]
+                 *acted, result.done[:, None]]
         self.replay.add(list(np.concatenate(parts, axis=1).astype(np.float32)))
 
 

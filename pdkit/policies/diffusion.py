@@ -8,10 +8,12 @@ With prediction="v_prediction" (Salimans and Ho, 2022; not in the paper) the net
 instead, from which both follow. Where all is noise that is the action itself; a network that must give the noise there has to pass
 its own input on through every layer to a high accuracy, which takes it many more gradient steps (lesson 03 shows both).
 
-The sequence begins with the oldest observation of the window, so its first `window - 1` actions lie in the past.
+The sequence begins with the oldest observation of the window, so its first `window - 1` actions lie in the past. The last steps of
+sampling may have a network of their own: what DPPO fine-tunes (pdkit/rl/dppo.py), while the steps before them stay as imitated.
 """
 from __future__ import annotations
 
+import copy
 from typing import Any
 
 import numpy as np
@@ -28,11 +30,12 @@ PREDICTIONS = ("epsilon", "v_prediction")
 
 class DiffusionPolicy(Policy):
     """Config: obs_dim, act_dim, window (observations), horizon (actions predicted), chunk (of them executed), dims, kernel, groups and
-    embed of the U-Net, diffusion_steps of training, prediction ("epsilon", "v_prediction"), sampler ("ddim", "ddpm") and sampler_steps."""
+    embed of the U-Net, diffusion_steps of training, prediction ("epsilon", "v_prediction"), sampler ("ddim", "ddpm"), sampler_steps, and
+    late_steps (the last so many steps of sampling have a network of their own; 0: one for all)."""
 
     kind = "diffusion"
     defaults: dict[str, Any] = dict(window=2, horizon=16, chunk=4, dims=[64, 128, 256], kernel=5, groups=8, embed=64, diffusion_steps=100,
-                                    prediction="epsilon", sampler="ddim", sampler_steps=4)
+                                    prediction="epsilon", sampler="ddim", sampler_steps=4, late_steps=0)
     training: dict[str, Any] = dict(lr=1e-4, beta1=0.95, weight_decay=1e-6, schedule="cosine", lr_warmup=500, ema_power=0.75)
 
     def __init__(self, config: dict[str, Any]):
@@ -55,6 +58,21 @@ class DiffusionPolicy(Policy):
         self.noise = _scheduler("ddpm", c)
         self.sampler = _scheduler(c["sampler"], c)
         self.sampler.set_timesteps(c["sampler_steps"] if c["sampler"] == "ddim" else c["diffusion_steps"])
+        if not 0 <= c["late_steps"] <= self.sampling_steps:
+            raise PdkitError(f"The steps with a network of their own must be from 0 to all {self.sampling_steps} of the sampler's, not "
+                             f"{c['late_steps']}.")
+        self.late = copy.deepcopy(self.unet) if c["late_steps"] else None
+
+    @property
+    def sampling_steps(self) -> int:
+        """How many steps lead from noise to actions."""
+        return len(self.sampler.timesteps)
+
+    def with_late(self, steps: int) -> DiffusionPolicy:
+        """A copy of a policy with one network whose last `steps` steps of sampling go through a copy of it: it acts as this one does."""
+        policy = DiffusionPolicy(self.config | {"late_steps": steps})
+        policy.load_state_dict(self.state_dict() | {f"late.{name}": tensor for name, tensor in self.unet.state_dict().items()})
+        return policy.eval()
 
     def fit_statistics(self, observations: np.ndarray, actions: np.ndarray, seed: int = 0) -> None:
         self.normalizer.fit(observations)
@@ -73,10 +91,14 @@ class DiffusionPolicy(Policy):
     def denoise(self, windows: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
         """All actions (N, horizon, act_dim) that pure noise of that shape becomes."""
         actions, condition = noise, self.condition(windows)
-        for step in self.sampler.timesteps:
-            predicted = self.unet(actions, step.expand(len(actions)).to(actions.device), condition)
-            actions = self.sampler.step(predicted.float(), step, actions).prev_sample
+        for number, step in enumerate(self.sampler.timesteps):
+            actions = self.sampler.step(self.predicted(number, actions, condition), step, actions).prev_sample
         return actions
+
+    def predicted(self, number: int, actions: torch.Tensor, condition: torch.Tensor) -> torch.Tensor:
+        """The noise (or v) in sequences (N, horizon, act_dim), by the network in charge of step `number` of sampling (the first is 0)."""
+        network = self.late if number >= self.sampling_steps - self.config["late_steps"] else self.unet
+        return network(actions, self.sampler.timesteps[number].expand(len(actions)).to(actions.device), condition).float()
 
     def forward(self, windows: torch.Tensor) -> torch.Tensor:
         noise = torch.randn(len(windows), self.horizon, self.config["act_dim"]).to(windows.device)

@@ -10,20 +10,20 @@ from .base import Normalizer, Policy
 
 
 class Zero(Policy):
-    """Config: obs_dim, act_dim, window. It carries a normaliser, so that networks beside it see observations as usual."""
+    """Config: obs_dim, act_dim, window, chunk. It carries a normaliser, so that networks beside it see observations as usual."""
 
     kind = "zero"
-    defaults: dict[str, Any] = dict(window=1)
+    defaults: dict[str, Any] = dict(window=1, chunk=1)
 
     def __init__(self, config: dict[str, Any]):
         super().__init__(self.defaults | config)
-        self.window = self.config["window"]
+        self.window, self.chunk = self.config["window"], self.config["chunk"]
         self.normalizer = Normalizer(self.config["obs_dim"])
 
     @classmethod
-    def instead_of(cls, policy: Policy, window: int = 1) -> Zero:
+    def instead_of(cls, policy: Policy, window: int = 1, chunk: int = 1) -> Zero:
         """One with the dimensions and the normaliser of another policy."""
-        zero = cls({"obs_dim": policy.config["obs_dim"], "act_dim": policy.config["act_dim"], "window": window})
+        zero = cls({"obs_dim": policy.config["obs_dim"], "act_dim": policy.config["act_dim"], "window": window, "chunk": chunk})
         zero.normalizer.load_state_dict(policy.normalizer.state_dict())
         return zero.eval()
 
@@ -32,9 +32,9 @@ class Zero(Policy):
         self.normalizer.fit(observations)
 
     def forward(self, windows: torch.Tensor) -> torch.Tensor:
-        return torch.zeros(len(windows), 1, self.config["act_dim"], device=windows.device)
+        return torch.zeros(len(windows), self.chunk, self.config["act_dim"], device=windows.device)
 
     @torch.inference_mode()
     def act(self, windows: np.ndarray) -> np.ndarray:
         """Zeros; nothing to look a device up from."""
-        return np.zeros((len(windows), 1, self.config["act_dim"]), np.float32)
+        return np.zeros((len(windows), self.chunk, self.config["act_dim"]), np.float32)

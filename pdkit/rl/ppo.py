@@ -78,19 +78,22 @@ class PPO:
         actor: another actor than the small Gaussian one: a module with `heads`, `squash` and `mean_action` as `Actor` has them.
         value: another value function than the plain one: a `Critics` of one member; it may share modules with the actor.
         value_view: what the value function sees of a normalised observation, (B, stored) -> (B, obs_dim); all of it by default.
+        value_lr: the learning rate of what belongs to the value function alone; the policy's by default.
     """
 
     def __init__(self, obs_dim: int, act_dim: int, config: MethodConfig, sizes: SACConfig, decorator: DecoratorConfig, *,
                  normalize=None, actor: nn.Module | None = None, value: Critics | None = None, value_view=None,
-                 device: str = "cpu"):
+                 value_lr: float | None = None, device: str = "cpu"):
         self.config, self.decorator, self.device = config, decorator, device
         self.normalize, self.value_view = normalize or (lambda x: x), value_view or (lambda x: x)
         dim, s = decorator.actor_dim(obs_dim, act_dim), sizes
         self.actor = (actor or Actor(dim, act_dim, s.hidden, s.layers, s.actor_layer_norm, s.log_std_range)).to(device)
         self.value = (value or Critics(dim, s.hidden, s.layers, 1, s.critic_layer_norm)).to(device)
-        both = dict.fromkeys([*self.actor.parameters(), *self.value.parameters()])  # once each, where they share some
-        self.parameters = [p for p in both if p.requires_grad]
-        self.optimizer = torch.optim.Adam(self.parameters, lr=config.ppo_lr, eps=1e-5, fused=True)
+        policy = dict.fromkeys(p for p in self.actor.parameters() if p.requires_grad)
+        alone = [p for p in self.value.parameters() if p.requires_grad and p not in policy]  # they may share some
+        self.parameters, self.rates = [*policy, *alone], (config.ppo_lr, value_lr or config.ppo_lr)
+        groups = [{"params": group, "lr": lr} for group, lr in zip((list(policy), alone), self.rates, strict=True)]
+        self.optimizer = torch.optim.Adam(groups, eps=1e-5, fused=True)
         self.updates = 0
 
     @torch.no_grad()
@@ -106,21 +109,24 @@ class PPO:
 
     def update(self, rollout: dict[str, torch.Tensor], num_envs: int, generator: torch.Generator) -> dict[str, torch.Tensor]:
         """Epochs of minibatches over a rollout: columns of a replay, decision by decision, each of all environments."""
-        c = self.config
-        with torch.no_grad():
-            old, ahead = self.values(rollout["obs"], rollout["base"]), self.values(rollout["next_obs"], rollout["next_base"])
-            columns = (rollout["reward"], rollout["discount"], rollout["done"], old, ahead)
-            advantages = gae(*(x.view(-1, num_envs) for x in columns), c.ppo_gae_lambda).flatten()
-            data = {k: rollout[k] for k in ("obs", "base", "residual", "log_prob", "open")}
-            data |= {"old": old, "returns": advantages + old, "advantage": standardised(advantages, rollout["open"])}
+        c, data = self.config, self._prepared(rollout, num_envs)
         log: dict[str, torch.Tensor] = {}
         for _ in range(c.ppo_epochs):
-            for rows in torch.randperm(len(old), generator=generator).chunk(c.ppo_minibatches):
-                noise = torch.randn((len(rows), data["base"].shape[1]), generator=generator).to(self.device)
+            for rows in torch.randperm(len(data["advantage"]), generator=generator).chunk(c.ppo_minibatches):
+                noise = torch.randn((len(rows), rollout["base"].shape[1]), generator=generator).to(self.device)
                 log = self._step({k: v[rows.to(self.device)] for k, v in data.items()}, noise)
             if c.ppo_target_kl and float(log["kl"]) > c.ppo_target_kl:
                 break
-        return log | {"target_mean": data["returns"].mean(), "open": data["open"].mean()}
+        return log | {"target_mean": data["returns"].mean(), "open": rollout["open"].mean()}
+
+    @torch.no_grad()
+    def _prepared(self, rollout: dict[str, torch.Tensor], num_envs: int) -> dict[str, torch.Tensor]:
+        """The rows that minibatches are drawn from: what was decided, and what came of it."""
+        old, ahead = self.values(rollout["obs"], rollout["base"]), self.values(rollout["next_obs"], rollout["next_base"])
+        columns = (rollout["reward"], rollout["discount"], rollout["done"], old, ahead)
+        advantages = gae(*(x.view(-1, num_envs) for x in columns), self.config.ppo_gae_lambda).flatten()
+        data = {k: rollout[k] for k in ("obs", "base", "residual", "log_prob", "open")}
+        return data | {"old": old, "returns": advantages + old, "advantage": standardised(advantages, rollout["open"])}
 
     def _step(self, batch: dict[str, torch.Tensor], noise: torch.Tensor) -> dict[str, torch.Tensor]:
         c, open_ = self.config, batch["open"]
@@ -129,12 +135,7 @@ class PPO:
         surrogate = (open_ * clipped_surrogate(log_ratio, batch["advantage"], c.ppo_clip)).mean()
         entropy = -(open_ * log_prob(mean + log_std.exp() * noise, mean, log_std)).mean()
         value_loss = clipped_value_loss(self.values(batch["obs"], batch["base"]), batch["old"], batch["returns"], c.ppo_clip).mean()
-        loss = c.ppo_value_coef * value_loss - surrogate - c.ppo_entropy_coef * entropy
-        self.optimizer.zero_grad(set_to_none=True)
-        loss.backward()
-        torch.nn.utils.clip_grad_norm_(self.parameters, c.ppo_grad_clip)
-        self.optimizer.step()
-        self.updates += 1
+        self._descend(c.ppo_value_coef * value_loss - surrogate - c.ppo_entropy_coef * entropy)
         with torch.no_grad():
             share, ratio = open_.sum().clamp(min=1), log_ratio.exp()
             return {"policy_loss": -surrogate.detach(), "value_loss": value_loss.detach(), "entropy": entropy * len(open_) / share,
@@ -142,10 +143,18 @@ class PPO:
                     "clipped": (open_ * ((ratio - 1).abs() > c.ppo_clip)).sum() / share,
                     "residual_abs": self.actor.squash(mean).abs().mean()}
 
+    def _descend(self, loss: torch.Tensor) -> None:
+        """One gradient step."""
+        self.optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(self.parameters, self.config.ppo_grad_clip)
+        self.optimizer.step()
+        self.updates += 1
+
     def scale_lr(self, factor: float) -> None:
         """Scale the learning rate (smaller late steps)."""
-        for group in self.optimizer.param_groups:
-            group["lr"] = self.config.ppo_lr * factor
+        for group, lr in zip(self.optimizer.param_groups, self.rates, strict=True):
+            group["lr"] = lr * factor
 
     def state(self) -> dict[str, torch.Tensor]:
         """Everything that training goes on from, as named tensors."""

@@ -15,12 +15,15 @@ COLUMNS = ("obs", "residual", "base", "reward", "next_obs", "next_base", "discou
 
 
 class Replay:
-    """A ring of transitions in one float32 matrix, so that sampling is one gather; `extra` names further numbers, one a row."""
+    """A ring of transitions in one float32 matrix, so that sampling is one gather. After COLUMNS come those of `wide` (name -> width),
+    then those of `extra`, one number each."""
 
-    def __init__(self, capacity: int, obs_dim: int, act_dim: int, device: str = "cpu", extra: tuple[str, ...] = ()):
-        widths = [obs_dim, act_dim, act_dim, 1, obs_dim, act_dim, 1, *[1] * len(extra)]
-        ends = np.cumsum(widths)
-        self.slices = {name: slice(int(e - w), int(e)) for name, w, e in zip(COLUMNS + extra, widths, ends, strict=True)}
+    def __init__(self, capacity: int, obs_dim: int, act_dim: int, device: str = "cpu", extra: tuple[str, ...] = (),
+                 wide: dict[str, int] | None = None):
+        usual = dict(zip(COLUMNS, (obs_dim, act_dim, act_dim, 1, obs_dim, act_dim, 1), strict=True))
+        widths = usual | (wide or {}) | dict.fromkeys(extra, 1)
+        ends = np.cumsum(list(widths.values()))
+        self.slices = {name: slice(int(e - w), int(e)) for (name, w), e in zip(widths.items(), ends, strict=True)}
         self.scalars = ("reward", "discount", *extra)
         self.rows = torch.zeros(capacity, int(ends[-1]), device=device)
         self.capacity, self.size, self.position = capacity, 0, 0

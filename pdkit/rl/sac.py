@@ -167,17 +167,21 @@ class SAC:
             torch.nn.utils.clip_grad_norm_(self.actor.parameters(), self.config.grad_clip)
             self.actor_optimizer.step()
         self._hold_critics(False)
-        with torch.no_grad():
-            if self.config.average:
-                # A plain mean at first (decay 1 - 1/k), so that the near-zero start is forgotten quickly.
-                decay = min(self.config.average, 1 - 1 / (self.updates // self.config.actor_every + 1))
-                torch._foreach_lerp_(list(self.average.parameters()), list(self.actor.parameters()), 1 - decay)
+        self._average_actor()
         entropy = -log_pi.detach().mean()
         if self.temperature_optimizer:
             self.temperature_optimizer.zero_grad(set_to_none=True)
             (self.log_temperature * (entropy - self.target_entropy)).backward()
             self.temperature_optimizer.step()
         return {"actor_loss": loss.detach(), "entropy": entropy, "temperature": temperature, "residual_abs": residual.detach().abs().mean()}
+
+    @torch.no_grad()
+    def _average_actor(self) -> None:
+        """Take the actor as it stands into the average."""
+        if self.config.average:
+            # A plain mean at first (decay 1 - 1/k), so that the near-zero start is forgotten quickly.
+            decay = min(self.config.average, 1 - 1 / (self.updates // self.config.actor_every + 1))
+            torch._foreach_lerp_(list(self.average.parameters()), list(self.actor.parameters()), 1 - decay)
 
     def _hold_critics(self, hold: bool) -> None:
         """Leave the critics out of the gradients while the actor moves: theirs would be thrown away."""
