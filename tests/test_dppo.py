@@ -251,7 +251,7 @@ def test_killed_and_resumed_gives_the_same_curve(tmp_path):
 
 
 def test_it_improves_a_biased_policy_and_leaves_the_start_alone(biased, tmp_path):  # noqa: F811
-    """From a third of the episodes to more than 60 %, by DPPO's own clip, discount and least stds."""
+    """By DPPO's own clip, discount and least stds."""
     before, ends = {k: v.clone() for k, v in biased.state_dict().items()}, []
     for seed in range(2):
         trainer = start(biased, seed=seed, num_envs=16, total_steps=14_000, gamma=0.8, ppo_epochs=8, ppo_minibatches=4, ppo_lr=1e-3,
