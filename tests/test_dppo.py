@@ -272,6 +272,8 @@ def test_it_improves_a_biased_policy_and_leaves_the_start_alone(biased, tmp_path
 def test_what_dppo_cannot_use_is_refused(tmp_path):
     with pytest.raises(PdkitError, match="kind diffusion, not probe"):
         start(biased_base())
+    with pytest.raises(PdkitError, match="320 decisions, 640 steps: take fewer"):
+        start(policy(ONE_LEVEL), ppo_rollout=80)
     with pytest.raises(PdkitError, match="from 0 to all 2 of the sampler's"):
         start(policy(ONE_LEVEL), dppo_steps=3)
     with pytest.raises(PdkitError, match="one that was only imitated"):
