@@ -248,7 +248,7 @@ def test_killed_and_resumed_gives_the_same_curve(tmp_path):
 
 
 def test_it_improves_a_biased_policy_and_leaves_the_start_alone(biased, tmp_path):
-    """From a third of the episodes to 60 % and more: once through all weights, once through adapters."""
+    """Once through all weights, once through adapters."""
     before, ends = {k: v.clone() for k, v in biased.state_dict().items()}, []
     for seed, rank in enumerate((0, 4)):
         trainer = start(biased, seed=seed, lora=rank, num_envs=16, total_steps=10_000, warmup_steps=2_500, utd=0.08, batch=256, gamma=0.8,

@@ -252,7 +252,7 @@ def test_killed_and_resumed_gives_the_same_curve(tmp_path):
 
 
 def test_it_improves_a_biased_policy_and_leaves_the_start_alone(biased, tmp_path):  # noqa: F811
-    """From a third of the episodes to more than 60 %, by DPPO's own clip, discount and least stds."""
+    """By DPPO's own clip, discount and least stds."""
     before, ends = {k: v.clone() for k, v in biased.state_dict().items()}, []
     for seed in range(2):
         trainer = start(biased, seed=seed, num_envs=16, total_steps=14_000, gamma=0.8, ppo_epochs=8, ppo_minibatches=4, ppo_lr=1e-3,
@@ -273,6 +273,8 @@ def test_it_improves_a_biased_policy_and_leaves_the_start_alone(biased, tmp_path
 def test_what_dppo_cannot_use_is_refused(tmp_path):
     with pytest.raises(PdkitError, match="kind diffusion, not probe"):
         start(biased_base())
+    with pytest.raises(PdkitError, match="320 decisions, 640 steps: take fewer"):
+        start(policy(ONE_LEVEL), ppo_rollout=80)
     with pytest.raises(PdkitError, match="from 0 to all 2 of the sampler's"):
         start(policy(ONE_LEVEL), dppo_steps=3)
     with pytest.raises(PdkitError, match="one that was only imitated"):

@@ -29,8 +29,8 @@ _OWN_POLICY = dict(alpha=1.0, alpha_scale=(), H=0, residual_penalty=0.0)
 # many updates a step, bring it near a decorator's run (data/results/leaderboard.csv: updates, train_minutes).
 _TRANSFORMER = dict(batch=64, utd=0.125)
 
-# A U-Net of 4.4 million weights with adapters, which also denoises in four steps for every target: 0.28 s of CPU an update of 64 on a
-# busy core, eight minutes for these updates on Door; half of the original's steps in actions.
+# A U-Net with adapters, which also denoises in four steps for every target, so an update is slow: there are fewer, each with half of the
+# original's steps in actions. Not tuned: no recorded run on a task yet.
 _DIFFUSION = dict(batch=64, utd=0.03, dipo_steps=10)
 
 # PPO learns from its own policy alone, with the learning rate falling from the start (as in cleanrl) and a spread that starts at 0.6
@@ -112,9 +112,8 @@ METHODS: dict[str, Method] = {
     "dppo": Method(
         "DPPO", "Ren et al. 2024; appendix C.2, H.2; facts.md 3.8: PPO on the denoising steps of a Diffusion Policy",
         changes=_ON_POLICY | _OWN_POLICY | dict(lora=0, ppo_lr=1e-4, ppo_grad_clip=1e6),  # in effect none
-        # Chunks are fewer decisions, each with four steps to learn from: smaller rollouts, fewer passes. A gradient step on 256 rows
-        # of a U-Net takes 0.46 s of CPU on a busy core, ten minutes for these on Door.
-        lesson=dict(ppo_rollout=64, ppo_minibatches=8, ppo_epochs=5), paper=dict(ppo_rollout=400, ppo_minibatches=20, gamma=0.999),
+        # Chunks are fewer decisions, each with four steps to learn from: smaller rollouts, fewer passes. Not tuned either.
+        lesson=dict(ppo_rollout=32, ppo_minibatches=4, ppo_epochs=5), paper=dict(ppo_rollout=400, ppo_minibatches=20, gamma=0.999),
         base="diffusion", trainer="pdkit.methods.dppo:DPPO"),
     "jsrl": Method(
         "JSRL", "Uchendu et al. 2023; appendix B.5; facts.md 3.4: the base policy begins each episode, a learner from scratch ends it",

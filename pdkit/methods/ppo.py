@@ -36,9 +36,9 @@ class OnPolicy(Trainer):
 
     def __init__(self, config, base, demos=None, spec=None):
         m, rows = config.method_config, config.method_config.ppo_rollout * config.num_envs
-        if rows >= config.total_steps or m.ppo_minibatches > rows:
-            raise PdkitError(f"PPO learns from rollouts of ppo_rollout * num_envs = {rows} decisions: take fewer than total_steps "
-                             f"({config.total_steps}) and at least ppo_minibatches ({m.ppo_minibatches}).")
+        if rows * base.chunk >= config.total_steps or m.ppo_minibatches > rows:
+            raise PdkitError(f"PPO learns from rollouts of ppo_rollout * num_envs = {rows} decisions, {rows * base.chunk} steps: "
+                             f"take fewer than total_steps ({config.total_steps}) and at least ppo_minibatches ({m.ppo_minibatches}).")
         if config.warmup_steps or config.demo_fraction:
             raise PdkitError("PPO learns from its own policy's decisions only: set warmup_steps=0 and demo_fraction=0.")
         self.reward_scale = 1 - config.gamma if config.gamma < 1 else 1.0
