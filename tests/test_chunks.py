@@ -13,7 +13,7 @@ from pdkit.online_config import OnlineConfig, decision_reward
 from pdkit.online_rows import demo_rows
 from pdkit.policies import DiffusionPolicy
 from pdkit.probes import PROBES, ProbeBase
-from pdkit.profiles import build
+from pdkit.profiles import build, online_config, policy_values
 from pdkit.rl.networks import Actor
 
 BIASED = dict(obs_dim=4, act_dim=2, kind="reach", bias=[0.2, -0.2])
@@ -127,3 +127,14 @@ def test_rollouts_of_chunks_are_recorded_step_by_step():
 def test_methods_for_single_actions_say_so():
     with pytest.raises(PdkitError, match="decides on 2 at once"):
         reach_trainer("jsrl", TwoAtOnce(BIASED), eval_every=1000, eval_episodes=5)
+
+
+def test_the_papers_budgets_count_chunks_and_ours_primitive_steps():
+    """facts.md 1.3 and 1.4: 4M chunks of 4 actions by default, TurnFaucet 2M, H 100,000 chunks, 0.25 updates a chunk."""
+    paper = online_config("TurnFaucet", "paper", **policy_values("TurnFaucet", "paper", "diffusion"))
+    assert (paper.total_steps, paper.decorator.H, paper.utd, paper.warmup_steps) == (8_000_000, 400_000, 0.0625, 32_000)
+    chair = policy_values("PushChair", "paper", "diffusion")
+    assert (chair["alpha"], chair["H"], chair["gamma"]) == (0.2, 1_200_000, 0.9)
+    assert policy_values("TurnFaucet", "paper", "bet") == policy_values("Door", "lesson", "mlp") == {}
+    lesson = policy_values("StackCube", "lesson", "diffusion")
+    assert 0.98**4 == pytest.approx(lesson["gamma"], abs=0.01)  # StackCube's discount a step, over four of them
