@@ -7,6 +7,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from test_maniskill import BEFORE_CONTACT, SAME_BITS, play
 
 from pdkit.demos import save_demos
 from pdkit.demos.experts import scripted_episodes
@@ -17,7 +18,6 @@ from pdkit.tasks import faucet_assets, get_task
 from pdkit.tasks.faucet import StockTurnFaucetSource, TurnFaucet, TurnFaucetSource, _corners
 from pdkit.tasks.faucet_assets import PARTNET_NOVEL, PARTNET_SOURCE, VARIABLE, faucets
 from pdkit.train import base_demos
-from tests.test_maniskill import BEFORE_CONTACT, SAME_BITS, play
 
 SPAN, AXIS, PLACE, LEFT = 32, slice(33, 36), slice(36, 39), 39
 

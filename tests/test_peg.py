@@ -4,13 +4,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from test_maniskill import BEFORE_CONTACT, SAME_BITS, play
 
 from pdkit.demos.experts import scripted_episodes
 from pdkit.demos.peg_expert import PegInsertionSideExpert
 from pdkit.demos.pose_control import turn
 from pdkit.tasks import get_task, quaternions
 from pdkit.tasks.peg import PegInsertionSide, StockPegInsertionSide, peg_start
-from tests.test_maniskill import BEFORE_CONTACT, SAME_BITS, play
 
 TOOL, PEG, SIZE, HOLE, RADIUS = slice(25, 32), slice(32, 39), slice(39, 42), slice(42, 49), 49
 
