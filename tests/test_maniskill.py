@@ -175,7 +175,7 @@ import hashlib, json, sys
 import pdkit.tasks.stack_cube as stack_cube
 from pdkit.errors import PdkitError
 lazy = not {"sapien", "mani_skill", "gymnasium"} & set(sys.modules)
-from test_maniskill import digest
+from tests.test_maniskill import digest
 result = dict(lazy=lazy, digest=digest(stack_cube.StackCube()))
 try:
     stack_cube.StackCube(render=True)
