@@ -85,7 +85,7 @@ def parse_settings(settings: list[str]) -> dict[str, Any]:
 def base_demos(args) -> Demos:
     """The demonstrations that the arguments name."""
     wanted = get_task(args.task).demo_task or args.task
-    demos = load_demos(args.demos) if args.demos else sources.bundled(wanted)
+    demos = load_demos(args.demos) if args.demos else sources.bundled(args.task)
     if demos.task != wanted:
         raise PdkitError(f"{args.demos} holds demonstrations of {demos.task}, not of {wanted}.")
     return demos.first(args.num_demos) if args.num_demos is not None else demos
