@@ -23,6 +23,7 @@ VERBS = {  # verb: (what it does, the function that does it, given the remaining
     "doctor": ("check this machine, with the fix beside each problem", "pdkit.doctor:main"),
     "demos": ("make demonstrations of a task, or look at them", "pdkit.demos.cli:main"),
     "train": ("train a base policy or a decorated one", "pdkit.train:main"),
+    "evaluate": ("success of a saved policy on a task's test episodes, or on several tasks'", "pdkit.transfer:main"),
     "nb": ("run a notebook without a browser, with other parameters", "pdkit.nb:main"),
     "sweep": ("run a grid of trainings or notebooks, two at a time or on Ray", "pdkit.sweep:main"),
     "report": ("list the paper's claims with what was measured", "pdkit.report:main"),

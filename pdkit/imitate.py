@@ -180,6 +180,8 @@ def _scores(spec: TaskSpec, policy: Policy, config: ImitateConfig) -> dict[str, 
     """Success on the selection seeds; nothing without episodes."""
     if not config.eval_episodes:
         return {}
+    state = torch.get_rng_state()  # training draws from it too
     policy.reset(config.seed)
     table = evaluate(spec, policy.act, selection_seeds(config.eval_episodes), window=policy.window, chunk=policy.chunk)
+    torch.set_rng_state(state)
     return {"success_once": float(table.success_once.mean()), "success_at_end": float(table.success_at_end.mean())}

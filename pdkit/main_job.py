@@ -102,7 +102,7 @@ class Report:
 def main(argv: list[str]) -> int:
     """`pdkit run [--task T] [--profile P] [--seed N] [-p name=value ...]`; 0 when done, 130 when interrupted."""
     parser = Parser(prog="pdkit run", description="Decorate a base policy by online RL, compare the two, write a page.")
-    parser.add_argument("--task", default="Door", help="Door, Hammer, Pen, Relocate or StackCube (default: Door)")
+    parser.add_argument("--task", default="Door", help="one that comes with a base policy, such as StackCube (default: Door)")
     parser.add_argument("--profile", default="lesson", help=f"{', '.join(PROFILES)} (default: lesson)")
     parser.add_argument("--seed", default="0", help="of the training (default: 0)")
     parser.add_argument("-p", dest="parameters", metavar="NAME=VALUE", action="append", default=[],

@@ -28,7 +28,7 @@ from .online import Trainer
 from .online_config import OnlineConfig
 from .policies import POLICIES, Policy, load_policy, save_policy
 from .policies.base import read_card
-from .profiles import PROFILES, checked, differences, flat, policy_values
+from .profiles import PROFILES, checked, differences, flat
 from .recorded import record
 from .runs import Run, describe_machine, origin
 from .seeds import reported_seeds
@@ -85,7 +85,7 @@ def parse_settings(settings: list[str]) -> dict[str, Any]:
 def base_demos(args) -> Demos:
     """The demonstrations that the arguments name."""
     wanted = get_task(args.task).demo_task or args.task
-    demos = load_demos(args.demos) if args.demos else sources.bundled(wanted)
+    demos = load_demos(args.demos) if args.demos else sources.bundled(args.task)
     if demos.task != wanted:
         raise PdkitError(f"{args.demos} holds demonstrations of {demos.task}, not of {wanted}.")
     return demos.first(args.num_demos) if args.num_demos is not None else demos
@@ -122,8 +122,7 @@ def _decorated(args) -> int:
         raise PdkitError("--episodes must be at least 1 and every seed 0 or more.")
     for seed in args.seeds:
         base = load_policy(base_folder)
-        config = method_config(args.method, args.task, args.profile, seed,
-                               **policy_values(args.task, args.profile, base.kind) | settings)
+        config = method_config(args.method, args.task, args.profile, seed, policy=base, **settings)
         if args.num_demos is None:
             args.num_demos = _demos_of(base_folder)
         print(f"{args.task}, seed {seed}: " + str(differences(config, args.profile) or "the profile unchanged"), flush=True)

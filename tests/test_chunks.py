@@ -9,11 +9,13 @@ from pdkit.decorator import DecoratorConfig
 from pdkit.demos.sources import rollouts
 from pdkit.errors import PdkitError
 from pdkit.evaluate import evaluate
+from pdkit.methods import METHODS
+from pdkit.methods.registry import method_config
 from pdkit.online_config import OnlineConfig, decision_reward
 from pdkit.online_rows import demo_rows
 from pdkit.policies import DiffusionPolicy
 from pdkit.probes import PROBES, ProbeBase
-from pdkit.profiles import build, online_config, policy_values
+from pdkit.profiles import build, flat, online_config, policy_values
 from pdkit.rl.networks import Actor
 
 BIASED = dict(obs_dim=4, act_dim=2, kind="reach", bias=[0.2, -0.2])
@@ -131,10 +133,20 @@ def test_methods_for_single_actions_say_so():
 
 def test_the_papers_budgets_count_chunks_and_ours_primitive_steps():
     """facts.md 1.3 and 1.4: 4M chunks of 4 actions by default, TurnFaucet 2M, H 100,000 chunks, 0.25 updates a chunk."""
-    paper = online_config("TurnFaucet", "paper", **policy_values("TurnFaucet", "paper", "diffusion"))
+    paper = online_config("TurnFaucet", "paper", **policy_values("TurnFaucet", "paper", "diffusion", 4))
     assert (paper.total_steps, paper.decorator.H, paper.utd, paper.warmup_steps) == (8_000_000, 400_000, 0.0625, 32_000)
-    chair = policy_values("PushChair", "paper", "diffusion")
+    chair = policy_values("PushChair", "paper", "diffusion", 4)
     assert (chair["alpha"], chair["H"], chair["gamma"]) == (0.2, 1_200_000, 0.9)
-    assert policy_values("TurnFaucet", "paper", "bet") == policy_values("Door", "lesson", "mlp") == {}
-    lesson = policy_values("StackCube", "lesson", "diffusion")
-    assert 0.98**4 == pytest.approx(lesson["gamma"], abs=0.01)  # StackCube's discount a step, over four of them
+    assert policy_values("TurnFaucet", "paper", "bet", 1) == policy_values("Door", "lesson", "diffusion", 1) == {}
+    assert policy_values("StackCube", "lesson", "diffusion", 4) == {"gamma": 0.922, "n_step": 2}  # 0.98 and 5 a step
+
+
+def test_what_a_method_is_stays_with_it_whatever_the_policy():
+    """Residual RL keeps its open bound and gate over a Diffusion Policy; methods of single actions keep their discount."""
+    base = DiffusionPolicy(dict(obs_dim=4, act_dim=2, window=2, horizon=4, chunk=2, dims=[16, 32], groups=4, embed=16))
+    for method, m in METHODS.items():
+        for profile, own in (("lesson", m.changes | m.lesson), ("paper", m.changes | m.paper)):
+            config = flat(method_config(method, "StackCube", profile, policy=base))
+            assert all(config[name] == (list(value) if isinstance(value, tuple) else value) for name, value in own.items()), method
+    assert method_config("sac_from_scratch", "StackCube", policy=base).gamma == 0.98
+    assert method_config("residual_rl", "StackCube", policy=base).gamma == pytest.approx(0.98**2, abs=1e-3)

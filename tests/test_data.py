@@ -4,7 +4,7 @@ import pandas as pd
 import pytest
 
 from pdkit.decorated import load_decorated
-from pdkit.demos import load_demos
+from pdkit.demos import load_demos, sources
 from pdkit.doctor import data_files
 from pdkit.files import DATA, read_json, sha256
 from pdkit.policies import load_policy
@@ -12,7 +12,7 @@ from pdkit.profiles import online_config
 from pdkit.tasks import get_task
 
 ADROIT = ["Door", "Hammer", "Pen", "Relocate"]
-SHIPPED = [*ADROIT, "StackCube"]
+SHIPPED = dict.fromkeys(ADROIT, "agent") | {"StackCube": "scripted", "TurnFaucet": "scripted"}  # task: who made the demonstrations
 
 
 def test_every_bundled_file_has_the_recorded_checksum():
@@ -25,8 +25,8 @@ def test_the_repository_stays_small():
 
 @pytest.mark.parametrize("task", SHIPPED)
 def test_demonstrations_load_and_succeed(task):
-    demos = load_demos(DATA / "demos" / f"{task}.safetensors")
-    assert demos.label == ("agent" if task in ADROIT else "scripted")
+    demos = sources.bundled(task)
+    assert demos.label == SHIPPED[task] and demos.task == (get_task(task).demo_task or task)
     assert all(e["success"].any() for e in demos.episodes())
     assert demos.command.startswith("pdkit demos")
 
@@ -70,7 +70,7 @@ def test_checkpoints_load_and_fit_the_task(task):
     decorated = load_decorated(DATA / "checkpoints" / task / "decorated")
     assert base.config["obs_dim"] == decorated.base.config["obs_dim"] == spec.obs_dim
     card = read_json(DATA / "checkpoints" / task / "base" / "policy.json")["info"]
-    assert card["demos_checksum"] == load_demos(DATA / "demos" / f"{task}.safetensors").first(card["demos"]).checksum
+    assert card["demos_checksum"] == sources.bundled(task).first(card["demos"]).checksum
     # the decorated policy holds the very base policy that is shipped beside it
     for ours, theirs in zip(base.state_dict().values(), decorated.base.state_dict().values(), strict=True):
         assert ours.equal(theirs)

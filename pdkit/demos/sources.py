@@ -19,12 +19,15 @@ MINARI = {"Door": "D4RL/door/human-v2", "Pen": "D4RL/pen/human-v2", "Hammer": "D
 
 
 def bundled(task: str) -> Demos:
-    """The demonstrations that come with the kit. Raises PdkitError when there are none for this task."""
-    get_task(task)
-    path = DATA / "demos" / f"{task}.safetensors"
+    """The demonstrations that come with the kit and from which this task is learned: of a novel task those of its source task.
+
+    Raises PdkitError when there are none.
+    """
+    shown = get_task(task).demo_task or task
+    path = DATA / "demos" / f"{shown}.safetensors"
     if not path.exists():
         have = ", ".join(sorted(p.stem for p in path.parent.glob("*.safetensors"))) or "none"
-        raise PdkitError(f"No demonstrations of {task} are bundled (there are: {have}); make some with `pdkit demos`.")
+        raise PdkitError(f"No demonstrations of {shown} are bundled (there are: {have}); make some with `pdkit demos`.")
     return load_demos(path)
 
 

@@ -11,7 +11,7 @@ from ..files import DATA
 from ..online import Trainer
 from ..online_config import OnlineConfig
 from ..policies import Policy
-from ..profiles import online_config
+from ..profiles import online_config, policy_values
 from ..tasks.spec import TaskSpec
 from . import METHODS, Method
 
@@ -23,11 +23,14 @@ def get_method(name: str) -> Method:
     return METHODS[name]
 
 
-def method_config(method: str, task: str, profile: str = "lesson", seed: int = 0, /, **changes: Any) -> OnlineConfig:
-    """The configuration of a method on a task: the task's profile, then the method's changes, then `changes` (flat names)."""
+def method_config(method: str, task: str, profile: str = "lesson", seed: int = 0, /, policy: Policy | None = None,
+                  **changes: Any) -> OnlineConfig:
+    """The configuration of a method on a task: the task's profile, what it sets otherwise over this base policy where the method acts
+    in its chunks, then the method's changes, then `changes` (flat names)."""
     m = get_method(method)
     own = m.changes | {"lesson": m.lesson, "smoke": m.lesson, "paper": m.paper}.get(profile, {})
-    return online_config(task, profile, seed, **({"method": method} | own | changes))
+    over = policy_values(task, profile, policy.kind, policy.chunk) if policy is not None and trainer_of(method).chunks else {}
+    return online_config(task, profile, seed, **({"method": method} | over | own | changes))
 
 
 def base_folder(method: str, task: str) -> Path:

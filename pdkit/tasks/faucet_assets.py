@@ -5,25 +5,22 @@ for demonstrations and 3 novel ones for online learning and evaluation, in six s
 its own (a URDF with `link_0`, `link_1` for the handles). The novel ones have other sizes, places of the handles and ranges of
 turning, and no style that the source faucets lack.
 
-The environment variable PDKIT_PARTNET names a folder that holds `<id>/mobility_cvx.urdf` with its meshes for the faucets of
-the paper; then these are used instead. Sizes and semantics of those come with ManiSkill. The paper's text speaks of 3 novel
-faucets, its code registers 4: with PartNet these four are used.
+With PDKIT_PARTNET (see partnet.py) the faucets of the paper are used instead. Their sizes and semantics come with ManiSkill. The
+paper's text speaks of 3 novel faucets, its code registers 4: with PartNet these four are used.
 """
 from __future__ import annotations
 
-import os
+from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from xml.etree import ElementTree
 
 import numpy as np
 
 from ..errors import PdkitError
 from ..files import read_json
+from .partnet import Model, UrdfWriter, partnet_models
 
-VARIABLE = "PDKIT_PARTNET"
-PARTNET_SOURCE = ("5002", "5021", "5023", "5028", "5029", "5045", "5047", "5051", "5056", "5063")
-PARTNET_NOVEL = ("5014", "5037", "5053", "5062")
+PARTNET_SOURCE = (5002, 5021, 5023, 5028, 5029, 5045, 5047, 5051, 5056, 5063)
+PARTNET_NOVEL = (5014, 5037, 5053, 5062)
 NUM_SOURCE, NUM_NOVEL = 10, 3
 STYLES = ("lever on top", "lever at the side", "cross", "knob", "two levers", "two crosses")
 FIRST_SEED = 100  # of the generator
@@ -34,10 +31,9 @@ Box = tuple[Vector, Vector, Vector]  # edges, middle, roll-pitch-yaw: metres and
 
 @dataclass(frozen=True)
 class Faucet:
-    """One faucet, as ManiSkill's metadata and a URDF describe it."""
+    """One faucet: its description, and what ManiSkill's metadata add to it."""
 
-    name: str
-    urdf: str | Path  # the text itself, or a file with its meshes beside it
+    model: Model
     switches: tuple[str, ...]  # the links that are handles
     scale: float = 1.0
     height: float = 0.0  # of its origin over the table, metres
@@ -47,50 +43,52 @@ class Faucet:
 def faucets(novel: bool) -> tuple[Faucet, ...]:
     """The novel or the source faucets: PartNet-Mobility's where PDKIT_PARTNET names a folder, else ours.
 
-    Raises PdkitError where that folder is missing or lacks a faucet.
+    Raises PdkitError where that folder is missing, or lacks a faucet or a part of one.
     """
-    folder = os.environ.get(VARIABLE)
-    if folder:
-        return partnet_faucets(Path(folder).expanduser(), PARTNET_NOVEL if novel else PARTNET_SOURCE)
+    models = partnet_models(PARTNET_NOVEL if novel else PARTNET_SOURCE)
+    if models is not None:
+        return with_metadata(models)
     numbers = range(NUM_SOURCE, NUM_SOURCE + NUM_NOVEL) if novel else range(NUM_SOURCE)
     return tuple(generated_faucet(number) for number in numbers)
 
 
-def partnet_faucets(folder: Path, ids: tuple[str, ...]) -> tuple[Faucet, ...]:
-    """Faucets of PartNet-Mobility in `folder`. Raises PdkitError where the folder or one of them is not there."""
-    if not folder.is_dir():
-        raise PdkitError(f"{VARIABLE} names {folder}, which is not a folder; unset it to use the generated faucets.")
-    paths = {name: folder / name / "mobility_cvx.urdf" for name in ids}
-    missing = [name for name, path in paths.items() if not path.is_file()]
-    if missing:
-        raise PdkitError(f"{VARIABLE} names {folder}, which lacks mobility_cvx.urdf of the faucets {', '.join(missing)}; add them, or "
-                         "unset it to use the generated faucets.")
+def with_metadata(models: Sequence[Model]) -> tuple[Faucet, ...]:
+    """PartNet's faucets with handles, sizes and densities from ManiSkill's table. Raises PdkitError for one that is not in it."""
     from mani_skill import PACKAGE_ASSET_DIR
 
     known = read_json(PACKAGE_ASSET_DIR / "partnet_mobility/meta/info_faucet_train.json")
-    return tuple(_described(name, paths[name], known[name]) for name in ids)
+    for model in models:
+        if model.name not in known:
+            raise PdkitError(f"ManiSkill does not describe faucet {model.name}; reinstall mani-skill from environment.txt.")
+    return tuple(_described(model, known[model.name]) for model in models)
 
 
-def _described(name: str, path: Path, about: dict) -> Faucet:
+def _described(model: Model, about: dict) -> Faucet:
     switches = tuple(link for link, _, meaning in about["semantics"] if meaning == "switch")
-    return Faucet(name, path, switches, about["scale"], about["offset"][2], about.get("density", 8000.0))
+    return Faucet(model, switches, about["scale"], about["offset"][2], about.get("density", 8000.0))
 
 
 def generated_faucet(number: int) -> Faucet:
     """Faucet `number` of ours: the style goes round, everything else is drawn."""
     rng = np.random.default_rng(FIRST_SEED + number)
     body, handles = _BUILD[STYLES[number % len(STYLES)]](rng)
-    robot = ElementTree.Element("robot", name=f"faucet-{number}")
-    _add_link(robot, "base", [])
-    _add_link(robot, "link_base", body)
-    _add_joint(robot, "joint_base", "fixed", "base", "link_base", (0, 0, 0), (0, 0, 0))
+    urdf = UrdfWriter(f"faucet-{number}")
+    urdf.link("base")
+    urdf.link("link_base")
+    _add_boxes(urdf, "body", body)
+    urdf.joint("joint_base", "fixed", "base", "link_base")
     switches = []
     for i, (boxes, place, direction, range_) in enumerate(handles):
         switches.append(f"link_{i}")
-        _add_link(robot, switches[-1], boxes)
-        joint = _add_joint(robot, f"joint_{i}", "revolute", "link_base", switches[-1], place, direction)
-        ElementTree.SubElement(joint, "limit", lower="0", upper=f"{range_:.4f}", effort="100", velocity="10")
-    return Faucet(f"ours-{number}", ElementTree.tostring(robot, encoding="unicode"), tuple(switches))
+        urdf.link(switches[-1])
+        _add_boxes(urdf, "switch", boxes)
+        urdf.joint(f"joint_{i}", "revolute", "link_base", switches[-1], place, direction, limits=(0, round(range_, 4)))
+    return Faucet(Model(f"ours-{number}", urdf.text()), tuple(switches))
+
+
+def _add_boxes(urdf: UrdfWriter, part: str, boxes: list[Box]) -> None:
+    for size, middle, direction in boxes:
+        urdf.box(part, size, middle, direction)
 
 
 # ---- shapes: handles are described about their axis, which is z ------------------------------------------------------
@@ -179,28 +177,3 @@ def _two_crosses(rng: np.random.Generator) -> tuple[list[Box], list[Handle]]:
 
 
 _BUILD = dict(zip(STYLES, (_lever_on_top, _lever_at_the_side, _cross_on_top, _knob_on_top, _two_levers, _two_crosses), strict=True))
-
-
-# ---- URDF ------------------------------------------------------------------------------------------------------------
-
-def _text(values: Vector) -> str:
-    return " ".join(f"{value:.5f}" for value in values)
-
-
-def _add_link(robot: ElementTree.Element, name: str, boxes: list[Box]) -> None:
-    """A link whose collision shapes are what is seen."""
-    link = ElementTree.SubElement(robot, "link", name=name)
-    for size, middle, direction in boxes:
-        for kind in ("visual", "collision"):
-            shape = ElementTree.SubElement(link, kind)
-            ElementTree.SubElement(shape, "origin", xyz=_text(middle), rpy=_text(direction))
-            ElementTree.SubElement(ElementTree.SubElement(shape, "geometry"), "box", size=_text(size))
-
-
-def _add_joint(robot: ElementTree.Element, name: str, kind: str, parent: str, child: str, place: Vector, direction: Vector):
-    joint = ElementTree.SubElement(robot, "joint", name=name, type=kind)
-    ElementTree.SubElement(joint, "origin", xyz=_text(place), rpy=_text(direction))
-    ElementTree.SubElement(joint, "axis", xyz="0 0 1")
-    ElementTree.SubElement(joint, "parent", link=parent)
-    ElementTree.SubElement(joint, "child", link=child)
-    return joint

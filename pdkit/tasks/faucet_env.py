@@ -5,9 +5,7 @@ This environment takes its observation and its success rule, and start poses, jo
 """
 from __future__ import annotations
 
-import tempfile
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -56,19 +54,14 @@ def faucet_start(seed: int, models: tuple[Faucet, ...]) -> FaucetStart:
 def load_faucet(scene: Any, faucet: Faucet) -> Any:
     """Build a faucet into a ManiSkill scene; its `Articulation`. Friction and damping of the joints are ManiSkill 2's."""
     loader = scene.create_urdf_loader()
-    loader.name, loader.scale, loader.fix_root_link = faucet.name, faucet.scale, True
+    loader.name, loader.scale, loader.fix_root_link = faucet.model.name, faucet.scale, True
     loader.load_multiple_collisions_from_file = True
     loader.set_material(1, 1, 0)
     loader.set_density(faucet.density)
-    if isinstance(faucet.urdf, Path):
-        builder = loader.parse(str(faucet.urdf))["articulation_builders"][0]
-    else:
-        with tempfile.TemporaryDirectory() as folder:  # SAPIEN reads files only
-            path = Path(folder) / "mobility_cvx.urdf"
-            path.write_text(faucet.urdf)
-            builder = loader.parse(str(path))["articulation_builders"][0]
+    with faucet.model.file() as path:
+        builder = loader.parse(path)["articulation_builders"][0]
     builder.initial_pose = sapien.Pose([0, 0, faucet.height])
-    built = builder.build(name=faucet.name)
+    built = builder.build(name=faucet.model.name)
     for joint in built.active_joints:
         joint.set_friction(1.0)
         joint.set_drive_properties(0, 10.0)

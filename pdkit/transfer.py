@@ -1,0 +1,70 @@
+"""`pdkit evaluate`: a saved policy on the test episodes of one task or several, such as on source and on novel objects (Fig. 12)."""
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from .cli import Parser
+from .decorated import Decorated, load_decorated
+from .errors import PdkitError
+from .evaluate import evaluate
+from .policies import Policy, load_policy
+from .recorded import record
+from .seeds import reported_seeds
+from .stats import wilson
+from .tasks import get_task
+from .torch_setup import set_threads
+
+
+def load_any(folder: str | Path) -> tuple[str, Policy | Decorated]:
+    """What is saved in `folder`, "base" or "decorated", and the policy. Raises PdkitError when it is neither."""
+    folder = Path(folder)
+    if (folder / "decorated.json").exists():
+        return "decorated", load_decorated(folder)
+    return "base", load_policy(folder)
+
+
+def transfer(policy: Policy | Decorated, tasks: Sequence[str], episodes: int, **options: Any) -> pd.DataFrame:
+    """Success on the first `episodes` test seeds of each task, one row a task; `options` go to `evaluate`.
+
+    Columns: task, episodes, success with Wilson's 95 % interval (low, high), success_at_end. Raises PdkitError for an unknown task,
+    or one whose observations or actions are not the policy's.
+    """
+    specs = [get_task(task) for task in tasks]
+    config = (policy.base if isinstance(policy, Decorated) else policy).config
+    for spec in specs:
+        if (config["obs_dim"], config["act_dim"]) != (spec.obs_dim, spec.act_dim):
+            raise PdkitError(f"This policy takes {config['obs_dim']} numbers and gives {config['act_dim']}; {spec.name} gives "
+                             f"{spec.obs_dim} and takes {spec.act_dim}: choose a task with the policy's own robot and observations.")
+    rows = []
+    for spec in specs:
+        policy.reset(0)
+        table = evaluate(spec, policy.act, reported_seeds(episodes), window=policy.window, chunk=policy.chunk, num_envs=25, **options)
+        rate = wilson(int(table.success_once.sum()), episodes)
+        rows.append(dict(task=spec.name, episodes=episodes, success=rate.value, low=rate.low, high=rate.high,
+                         success_at_end=float(table.success_at_end.mean())))
+    return pd.DataFrame(rows)
+
+
+def main(argv: list[str]) -> int:
+    parser = Parser(prog="pdkit evaluate", description="Success of a saved policy on the test episodes of one task or several.")
+    parser.add_argument("policy", help="folder of a base policy or of a decorated one")
+    parser.add_argument("--tasks", nargs="+", required=True, help="for example TurnFaucetSource TurnFaucet")
+    parser.add_argument("--episodes", type=int, default=100, help="test episodes of each task (default 100)")
+    parser.add_argument("--record", help="name under data/results: a row a task is added to NAME.csv")
+    parser.add_argument("--threads", type=int, default=1)
+    args = parser.parse_args(argv)
+    if args.episodes < 1:
+        raise PdkitError(f"--episodes must be at least 1, not {args.episodes}.")
+    set_threads(args.threads)
+    kind, policy = load_any(args.policy)
+    rows = transfer(policy, args.tasks, args.episodes)
+    for row in rows.itertuples():
+        print(f"{row.task}: {wilson(round(row.success * row.episodes), row.episodes)}; at the last step {row.success_at_end:.1%}")
+    if args.record:
+        command = f"pdkit evaluate {args.policy} --tasks {' '.join(args.tasks)} --episodes {args.episodes} --record {args.record}"
+        record(args.record, rows.assign(recipe=kind, seed=0, command=command), pd.DataFrame())
+    return 0

@@ -1,0 +1,84 @@
+"""`pdkit evaluate`: a saved policy on the test episodes of several tasks, and the recorded gap between source and novel objects."""
+import dataclasses
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+
+from pdkit import cli, recorded, transfer
+from pdkit.decorated import Decorated, save_decorated
+from pdkit.decorator import DecoratorConfig
+from pdkit.errors import PdkitError
+from pdkit.files import read_json
+from pdkit.policies import save_policy
+from pdkit.policies.mlp import MLP
+from pdkit.probes import PROBES, ProbeBase
+from pdkit.rl.networks import Actor
+from pdkit.stats import wilson
+
+NEAR = PROBES["reach"]
+FAR = dataclasses.replace(NEAR, name="far", max_episode_steps=4)  # too short for most goals
+OTHER = dataclasses.replace(NEAR, name="other", obs_dim=5)
+
+
+@pytest.fixture(autouse=True)
+def probes(monkeypatch):
+    monkeypatch.setattr(transfer, "get_task", {spec.name: spec for spec in (NEAR, FAR, OTHER)}.__getitem__)
+
+
+def straight() -> ProbeBase:
+    return ProbeBase(dict(obs_dim=4, act_dim=2, kind="reach", bias=[0.0, 0.0]))
+
+
+def test_one_row_a_task_on_the_test_seeds(monkeypatch):
+    """Two of three episodes solved, one of them lost again; the seeds are those kept for reporting."""
+    asked = []
+
+    def told(spec, act, seeds, **options):
+        asked.append((spec.name, list(seeds), options["window"], options["chunk"]))
+        return pd.DataFrame({"seed": seeds, "success_once": [True, True, False], "success_at_end": [False, True, False]})
+
+    monkeypatch.setattr(transfer, "evaluate", told)
+    table = transfer.transfer(straight(), ["reach", "far"], 3)
+    assert asked == [(name, [1_000_000, 1_000_001, 1_000_002], 1, 1) for name in ("reach", "far")]
+    rate = wilson(2, 3)
+    for row in table.itertuples():
+        assert (row.episodes, row.success, row.success_at_end, row.low, row.high) == (3, 2 / 3, 1 / 3, rate.low, rate.high)
+
+
+def test_the_harder_task_is_solved_less_often():
+    table = transfer.transfer(straight(), ["reach", "far"], 12)
+    assert list(table.task) == ["reach", "far"] and table.success[1] < table.success[0]
+
+
+def test_a_policy_of_another_shape_is_refused_before_anything_runs(monkeypatch):
+    monkeypatch.setattr(transfer, "evaluate", lambda *words, **options: pytest.fail("it ran"))
+    with pytest.raises(PdkitError, match="takes 4 numbers and gives 2; other gives 5 and takes 2: choose a task"):
+        transfer.transfer(straight(), ["reach", "other"], 1)
+
+
+def test_the_command_records_a_row_a_task_for_base_and_decorated(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(recorded, "DATA", tmp_path)
+    torch.manual_seed(0)
+    base = MLP({"obs_dim": 4, "act_dim": 2, "hidden": 8, "layers": 1}).eval()
+    base.fit_statistics(np.random.default_rng(0).normal(size=(50, 4)), np.zeros((50, 2)))
+    save_policy(base, tmp_path / "base", {})
+    save_decorated(Decorated(base, Actor(4, 2, 8, 1, False, (-5.0, 2.0)).eval(), DecoratorConfig(alpha=0.1)), tmp_path / "decorated")
+    for kind in ("base", "decorated"):
+        words = ["evaluate", str(tmp_path / kind), "--tasks", "reach", "far", "--episodes", "3", "--record", "gap"]
+        assert cli.main(words) == 0
+        assert "far: " in capsys.readouterr().out
+        assert isinstance(transfer.load_any(tmp_path / kind)[1], Decorated) == (kind == "decorated")
+    table = pd.read_csv(tmp_path / "results" / "gap.csv")
+    assert list(table.task + " " + table.recipe) == ["far base", "far decorated", "reach base", "reach decorated"]
+    assert table.command[0] == f"pdkit evaluate {tmp_path / 'base'} --tasks reach far --episodes 3 --record gap"
+    assert read_json(tmp_path / "results" / "gap_manifest.json")["again"] == sorted(set(table.command))
+
+
+@pytest.mark.parametrize(("words", "message"), [
+    (["nowhere", "--tasks", "reach"], "nowhere"), (["nowhere", "--tasks", "reach", "--episodes", "0"], "at least 1, not 0"),
+    (["nowhere"], "--tasks")])
+def test_bad_words_are_told_in_one_sentence(words, message, capsys):
+    assert cli.main(["evaluate", *words]) == 2
+    assert message in capsys.readouterr().err
