@@ -6,7 +6,7 @@
 
 With prediction="v_prediction" (Salimans and Ho, 2022; not in the paper) the network gives v = sqrt(abar_k) eps - sqrt(1 - abar_k) a
 instead, from which both follow. Where all is noise that is the action itself; a network that must give the noise there has to pass
-its own input on through every layer to a high accuracy, which takes it many more gradient steps (lesson 03 shows both).
+its own input on through every layer to a high accuracy, which should take it more gradient steps (lesson 03 lets one compare).
 
 The sequence begins with the oldest observation of the window, so its first `window - 1` actions lie in the past. The last steps of
 sampling may have a network of their own: what DPPO fine-tunes (pdkit/rl/dppo.py), while the steps before them stay as imitated.
