@@ -52,8 +52,8 @@ class DiffusionPolicy(Policy):
             raise PdkitError(f"Diffusion Policy's chunk ({self.chunk}) must be at least 1 and fit between the latest of {self.window} "
                              f"observations and the horizon ({self.horizon}).")
         if c["kernel"] % 2 != 1 or c["embed"] % 2:
-            raise PdkitError(f"Diffusion Policy's kernel must be odd, so that its U-Net keeps the time's length, and embed even, half of it "
-                             f"sines and half cosines, not {c['kernel']} and {c['embed']}.")
+            raise PdkitError(f"Diffusion Policy's kernel must be odd, so that its U-Net keeps the time's length, and embed even, for sines "
+                             f"and cosines, not {c['kernel']} and {c['embed']}.")
         if any(d % c["groups"] for d in c["dims"]):
             raise PdkitError(f"Diffusion Policy's dims {c['dims']} must be multiples of its groups ({c['groups']}).")
         if not 1 <= c["sampler_steps"] <= c["diffusion_steps"]:

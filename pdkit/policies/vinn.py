@@ -5,8 +5,8 @@
 phi is the normalised observation ("raw"); or what the GPT of a trained Behavior Transformer makes of the window, at its last position;
 or the scales and shifts by which the observations steer all blocks of a trained Diffusion Policy's U-Net (FiLM; the paper does not say
 which of them, ours are all: they are the same at each diffusion step up to a constant, which distances do not see). k = 1 copies the
-nearest action, as FISH does. `exclusion` adds FISH's buffer against getting stuck: a neighbour that comes up for more than the `tolerance`-th time is passed over for the next nearest, and
-stays out until `exclusion` others have been put out after it (FISH: 3 and 1).
+nearest action, as FISH does. `exclusion` adds FISH's buffer against getting stuck: a neighbour that comes up for more than the
+`tolerance`-th time is passed over for the next nearest, and stays out until `exclusion` others have been put out after it (FISH: 3 and 1).
 
 FISH carries that buffer from step to step. A policy here holds no state per episode, so the buffer is played through again from the
 last `history` observations; what was chosen before them is forgotten. How large k is in the paper is not known: 5 is ours.
