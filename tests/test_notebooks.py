@@ -163,7 +163,7 @@ def test_residual_rl_and_fish(tmp_path):
     result = run("11", tmp_path, alpha=0.05, ks="[2]")
     assert result["stray"]["decorator"] < result["stray"]["bound alone"] < result["stray"]["residual RL"]
     assert set(result["first"]) == {"base policy", *result["stray"]} and result["early"] in ("reproduced", "partly", "not", "untested")
-    assert set(result["vinn"]) == {f"{features},{row}" for features in ("raw", "GPT") for row in ("k=2", "k=1,exclusion=3")}
+    assert set(result["vinn"]) == {f"{features},{row}" for features in ("raw", "GPT", "FiLM") for row in ("k=2", "k=1,exclusion=3")}
     assert 0 < result["late_ratio"]["policy_decorator"] < 0.05 < result["late_ratio"]["residual_rl"]
     assert result["transport"]["all episodes"] > 0.5 and result["exercise_solved"] is False
     assert (tmp_path / "vinn.png").exists() and not (tmp_path / "episodes.png").exists()
