@@ -210,6 +210,15 @@ def test_diffusion_lesson(tmp_path):
     assert all(0 <= part["low"] <= part["value"] <= part["high"] <= 1 for part in result["fork"].values())
 
 
+def test_other_base_policies(tmp_path):
+    result = run("04", tmp_path, families='["MLP", "CNN"]', ks="[2]")
+    assert set(result["curves"]) == set(result["chosen"]) == {"MLP", "CNN"} and all(len(c) == 2 for c in result["curves"].values())
+    assert set(result["parameters"]) == {"MLP", "BC-RNN", "CNN", "BeT", "Diffusion Policy"} and result["ms_step"]["MLP"] > 0
+    assert result["doubtful"]["Door"] < result["doubtful"]["StackCube"] and result["two_groups"]["StackCube"] > 0.9
+    assert all(set(rates) == {"2"} for rates in result["neighbours"].values()) and len(result["claims"]) == 4
+    assert (tmp_path / "gains.png").exists() and result["exercise_solved"] is False
+
+
 def test_interrupting_the_main_job_tells_how_to_go_on(monkeypatch, tmp_path, capsys):
     def run_notebook(name, values, out):
         raise KeyboardInterrupt
