@@ -22,10 +22,9 @@ from scipy import stats as scipy_stats
 from .demos.format import Demos
 from .errors import PdkitError
 from .evaluate import evaluate
-from .imitate import ImitateConfig, Windows, imitate
+from .imitate import ImitateConfig, Windows, gradient_step, imitate, make_optimizer
 from .policies import POLICIES, Policy
 from .tasks.spec import TaskSpec
-from .torch_setup import autocast
 
 
 @dataclass(frozen=True)
@@ -71,20 +70,10 @@ def costs(families: Mapping[str, Family], demos: Demos, spec: TaskSpec, *, lanes
     for name, family in families.items():
         policy, config = fresh(family, demos, spec), family.settings(1, 0)
         batch = Windows(demos, policy.window, True, policy.horizon, spec.resting).sample(config.batch, torch.Generator().manual_seed(0))
-        optimizer = torch.optim.AdamW(policy.parameter_groups(config.weight_decay), fused=True)
-
-        def learn(policy=policy, batch=batch, optimizer=optimizer, bf16=config.bf16) -> None:
-            with autocast("cpu", bf16):
-                loss = policy.loss(*batch)["loss"]
-            optimizer.zero_grad(set_to_none=True)
-            loss.backward()
-            optimizer.step()
-
-        policy.train()
-        gradient_step = _milliseconds(learn, repeats)
+        learning = _milliseconds(partial(gradient_step, policy.train(), make_optimizer(policy, config), *batch, config.bf16), repeats)
         acting = _milliseconds(partial(policy.eval().act, np.zeros((lanes, policy.window, spec.obs_dim), np.float32)), repeats)
         rows.append({"family": name, "parameters": sum(p.numel() for p in policy.parameters()), "window": policy.window,
-                     "chunk": policy.chunk, "batch": config.batch, "ms_gradient_step": gradient_step,
+                     "chunk": policy.chunk, "batch": config.batch, "ms_gradient_step": learning,
                      "ms_step": acting / lanes / policy.chunk})
     return pd.DataFrame(rows)
 
