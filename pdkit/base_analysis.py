@@ -45,11 +45,11 @@ class Family:
 
 # Small enough for minutes. A Diffusion Policy learns with its own rates, averaged weights and batch; all else is the same for all.
 FAMILIES = {
-    "MLP": Family("mlp", 400),
+    "MLP": Family("mlp", 300),
     "BC-RNN": Family("rnn", 400, dict(hidden=96)),
-    "CNN": Family("cnn", 400),
-    "BeT": Family("bet", 400, dict(embed=48, features=64)),
-    "Diffusion Policy": Family("diffusion", 600, dict(dims=[32, 64], horizon=8, prediction="v_prediction"),
+    "CNN": Family("cnn", 200),
+    "BeT": Family("bet", 300, dict(embed=48, features=64)),
+    "Diffusion Policy": Family("diffusion", 400, dict(dims=[32, 64], horizon=8, prediction="v_prediction"),
                                dict(lr=1e-3, lr_warmup=100, batch=128)),
 }
 

@@ -93,7 +93,7 @@ def test_best_of_by_hand_and_by_simulation():
 def test_a_family_trains_in_its_own_way_where_it_says_so():
     usual = analysis.FAMILIES["MLP"].settings(5, 50)
     assert (usual.batch, usual.lr, usual.ema_power) == (256, 1e-3, 0.0)
-    assert (usual.iterations, usual.eval_every, usual.eval_episodes) == (400, 80, 50)
+    assert (usual.iterations, usual.eval_every, usual.eval_episodes) == (300, 60, 50)
     chunked = analysis.FAMILIES["Diffusion Policy"].settings(3, 20, steps=90, seed=4)
     assert (chunked.batch, chunked.schedule, chunked.ema_power, chunked.iterations, chunked.eval_every, chunked.seed) == (
         128, "cosine", 0.75, 90, 30, 4)
