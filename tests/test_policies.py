@@ -164,6 +164,13 @@ def test_a_bad_setting_is_one_sentence_before_anything_is_trained(kind, setting,
     assert "\n" not in str(error.value) and setting.partition("=")[0] in str(error.value) and not (tmp_path / "p").exists()
 
 
+def test_the_policy_that_does_nothing_has_nothing_to_learn(tmp_path):
+    assert train.main(["base", "Door", "--policy", "zero", "--num-demos", "1", "--out", str(tmp_path), "--set", "eval_episodes=0"]) == 0
+    policy = load_policy(tmp_path)
+    assert policy.kind == "zero" and not policy.act(np.ones((2, 1, 39), np.float32)).any()
+    assert policy.normalizer.std.std() > 0  # fitted to the demonstrations
+
+
 def test_every_policy_and_each_of_its_whole_numbers_is_among_the_bad_settings():
     assert {kind for kind, _, _ in BAD} == set(POLICIES)
     for kind, policy in POLICIES.items():
