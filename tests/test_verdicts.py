@@ -74,6 +74,21 @@ def test_a_low_checkpoint_must_rise_by_more_than_20_points(results, ends, verdic
     assert found.command == "pdkit sweep data/sweeps/low_checkpoint.toml" and "10.0 %" in found.measured
 
 
+@pytest.mark.parametrize("kind, recipe", [("an MLP", "mlp"), ("a BC-RNN", "rnn"), ("a CNN", "cnn")])
+def test_another_base_policy_must_rise_by_more_than_20_points(results, kind, recipe):
+    """By its own rows alone; the paper's task is TurnFaucet, so that StackCube makes it partly at most."""
+    claim = f"Policy Decorator significantly improves {kind} base policy."
+    others = [runs(name, [0.1] * 3, task="StackCube", base=0.9) for name in {"mlp", "rnn", "cnn", "diffusion"} - {recipe}]
+    for ends, verdict in (([0.9, 0.8, 0.85], "partly"), ([0.55, 0.6, 0.5], "not"), ([0.9, 0.5, 0.8], "partly")):
+        write(results, "base_policies", *others, runs(recipe, ends, task="StackCube", base=0.4))
+        found = verdicts.find(claim)
+        assert (found.verdict, found.tasks) == (verdict, "StackCube") and f"{recipe} {100 * np.mean(ends):.1f} %" in found.measured
+    write(results, "base_policies", runs(recipe, [0.9, 0.8, 0.85], task="TurnFaucet", base=0.4))
+    assert verdicts.find(claim).verdict == "reproduced"
+    write(results, "base_policies", *others, runs(recipe, [0.9, 0.9], task="StackCube"))
+    assert verdicts.find(claim) is None
+
+
 def test_a_claim_about_more_tasks_is_partly_reproduced_at_most(results):
     claim = CLAIMS.claim[CLAIMS.claim.str.startswith("With BeT bases")].item()
     tables = [runs("policy_decorator", [1, 0.98, 0.99]), runs("jsrl", [0.7, 0.6, 0.5]), runs("sac_finetune", [0, 0, 0])]
