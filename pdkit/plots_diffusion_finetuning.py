@@ -41,8 +41,7 @@ def two_layers_figure(denoising: int, tuned: int, decisions: int = 3, chunk: int
         arrow((x + 0.75, 0), (x + 1.5, 0))
         ax.plot([x + 1.5, x + 1.5], [0, denoising + 1], color="#444444", lw=1.2)
         ax.text(x + 1.6, denoising / 2, f"reward $r_{{{d}}}$", rotation=90, va="center", fontsize=9)
-        if d < decisions - 1:
-            arrow((x + 1.5, denoising + 1), (x + 2.25, denoising + 1))
+        arrow((x + 1.5, denoising + 1), (x + (2.25 if d < decisions - 1 else 1.95), denoising + 1))
     ax.set(xlim=(-1.0, 3.0 * decisions - 0.5), ylim=(-0.6, denoising + 1.6), xticks=[], yticks=[])
     ax.grid(visible=False)
     ax.spines[["left", "bottom"]].set_visible(False)
