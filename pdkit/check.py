@@ -337,3 +337,18 @@ def interquartile_mean(answer: Callable, strict: bool = False) -> bool:
             yield f"for {shape[0]} runs on {shape[1]} tasks it gives {got:.4f}, not {expected:.4f}; floor(n / 4) are cut at either side."
 
     return _judge("interquartile_mean", complaints, strict)
+
+
+def object_mean(answer: Callable, strict: bool = False) -> bool:
+    """14: mean success over objects, each counted once, from outcomes (N,) of episodes and the name of each one's object (N,)."""
+    def complaints() -> Iterator[str]:
+        cases = (([1, 1, 1, 0, 0], list("aaabb"), 0.5), ([1, 0, 0, 0, 1, 1], list("abbbbb"), 0.7), ([1, 0, 1], list("aab"), 0.75))
+        for successes, objects, expected in cases:
+            got = float(answer(np.array(successes, float), np.array(objects)))
+            if abs(got - expected) < 1e-9:
+                continue
+            if abs(got - np.mean(successes)) < 1e-9:
+                yield "it is the mean over episodes: an object that comes up more often counts more."
+            yield f"for outcomes {successes} of objects {''.join(objects)} it gives {got:.3f}, not {expected:.3f}."
+
+    return _judge("object_mean", complaints, strict)

@@ -122,6 +122,22 @@ class Average:
             self._ema.restore(self._parameters)
 
 
+def make_optimizer(policy: Policy, config: ImitateConfig) -> torch.optim.AdamW:
+    """AdamW over the policy's parameter groups, as one kernel for all of them."""
+    return torch.optim.AdamW(policy.parameter_groups(config.weight_decay), lr=config.lr, betas=(config.beta1, 0.999), fused=True)
+
+
+def gradient_step(policy: Policy, optimizer: torch.optim.Optimizer, observations: torch.Tensor, actions: torch.Tensor, bf16: bool
+                  ) -> dict[str, torch.Tensor]:
+    """One step on windows (B, window, obs_dim) and actions (B, horizon or window, act_dim); the loss terms."""
+    with autocast(observations.device.type, bf16):
+        terms = policy.loss(observations, actions)
+    optimizer.zero_grad(set_to_none=True)
+    terms["loss"].backward()
+    optimizer.step()
+    return terms
+
+
 def imitate(kind: str, demos: Demos, config: ImitateConfig | None = None, policy_config: dict | None = None, *, device: str = "cpu",
             progress: Callable[[dict], None] | None = None, spec: TaskSpec | None = None) -> tuple[Policy, list[dict]]:
     """Train a policy of `kind` on `demos`; `spec` is for worlds outside the registry, such as the probes.
@@ -145,17 +161,12 @@ def imitate(kind: str, demos: Demos, config: ImitateConfig | None = None, policy
         if progress:
             progress(row)
         return policy.eval(), [row]
-    optimizer = torch.optim.AdamW(policy.parameter_groups(config.weight_decay), lr=config.lr, betas=(config.beta1, 0.999), fused=True)
+    optimizer = make_optimizer(policy, config)
     rates = torch.optim.lr_scheduler.LambdaLR(optimizer, config.lr_factor)
     average = Average(policy, config.ema_power) if config.ema_power else None
     history, best, best_state, started = [], -1.0, None, time.monotonic()
     for iteration in range(1, config.iterations + 1):
-        observations, actions = (x.to(device) for x in windows.sample(config.batch, generator))
-        with autocast(device, config.bf16):
-            terms = policy.loss(observations, actions)
-        optimizer.zero_grad(set_to_none=True)
-        terms["loss"].backward()
-        optimizer.step()
+        terms = gradient_step(policy, optimizer, *(x.to(device) for x in windows.sample(config.batch, generator)), config.bf16)
         rates.step()
         if average:
             average.step()

@@ -274,7 +274,8 @@ def test_the_specs_of_the_recorded_results_are_right(name):
     seeds = {}
     for one in jobs:
         seeds.setdefault((one.labels["task"], one.labels["recipe"]), []).append(one.labels["seed"])
-    assert all(len(own) >= 3 and own == [*range(len(own))] for own in seeds.values())
+    least = 1 if name == "objects" else 3  # it plays fixed policies on fixed episodes: no seed would change anything
+    assert all(len(own) >= least and own == [*range(len(own))] for own in seeds.values())
     if spec.kind == "train":
         for task in {one.labels["task"] for one in jobs}:
             budgets = {(one.config["total_steps"], one.parameters["episodes"]) for one in jobs if one.labels["task"] == task}
