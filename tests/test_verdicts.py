@@ -421,3 +421,30 @@ def test_the_reward_takes_longer_on_a_longer_way(results, updates, verdict):
     write(results, "exploration", rows.assign(seed=range(3), recipe="exploration", task="10", **{"updates.5-step.5": 1.0}))
     found = verdicts.find("With a longer horizon, the sparse reward takes longer to propagate through the trajectory.")
     assert found.verdict == verdict and "40 steps" in found.measured
+
+
+# ---- Diffusion Policy ------------------------------------------------------------------------------------------------
+
+OWN = "policy_decorator,alpha=0.03"
+
+
+@pytest.mark.parametrize("ends, dipo, lifts, beats, best", [
+    ([0.95, 0.96, 0.97], [0.0, 0.0, 0.0], "partly", "partly", "partly"),  # as the paper says, on one of its tasks
+    ([0.95, 0.96, 0.97], [0.0, 0.1, 0.0], "partly", "partly", "not"),
+    ([0.7, 0.72, 0.71], [0.0, 0.0, 0.0], "not", "partly", "partly"),
+    ([0.3, 0.28, 0.32], [0.6, 0.65, 0.7], "not", "not", "not")])
+def test_diffusion_policy_is_judged_by_the_papers_bound(results, ends, dipo, lifts, beats, best):
+    write(results, "diffusion_finetuning", *(runs(recipe, values, task="StackCube") for recipe, values in (
+        (OWN, ends), ("policy_decorator", [0.1, 0.1, 0.1]), ("dipo", dipo), ("residual_rl", [0.2, 0.1, 0.15]), ("dppo", [0.9, 0.9, 0.9]))))
+    claims_ = ("Policy Decorator lifts Diffusion", "With Diffusion Policy bases", "The best baseline that fine-tunes Diffusion")
+    found = [verdicts.find(CLAIMS.claim[CLAIMS.claim.str.startswith(words)].iloc[0]) for words in claims_]
+    assert [one.verdict for one in found] == [lifts, beats, best] and found[0].tasks == "StackCube" and "residual_rl" in found[1].measured
+
+
+def test_dppo_is_compared_on_other_tasks_than_the_papers(results):
+    claim = CLAIMS.claim[CLAIMS.claim.str.startswith("Policy Decorator on DPPO")].iloc[0]
+    for dppo, verdict in (([0.5, 0.55, 0.6], "partly"), ([0.9, 0.95, 0.99], "not")):
+        write(results, "diffusion_finetuning", runs(OWN, [0.8, 0.82, 0.85], task="StackCube"), runs("dppo", dppo, task="StackCube"))
+        assert verdicts.find(claim).verdict == verdict
+    write(results, "diffusion_finetuning", runs(OWN, [0.8], task="StackCube"), runs("dppo", [0.1], task="StackCube"))
+    assert verdicts.find(claim) is None
