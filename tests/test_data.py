@@ -12,7 +12,9 @@ from pdkit.profiles import online_config
 from pdkit.tasks import get_task
 
 ADROIT = ["Door", "Hammer", "Pen", "Relocate"]
-SHIPPED = dict.fromkeys(ADROIT, "agent") | {"StackCube": "scripted", "TurnFaucet": "scripted"}  # task: who made the demonstrations
+MANISKILL = ["PegInsertionSide", "StackCube", "TurnFaucet"]
+SHIPPED = dict.fromkeys(ADROIT, "agent") | dict.fromkeys(MANISKILL, "scripted")  # task: who made the demonstrations
+NOT_REPAIRED = ["PegInsertionSide"]  # decorated, it is no better than its base: the README says so
 
 
 def test_every_bundled_file_has_the_recorded_checksum():
@@ -105,4 +107,4 @@ def test_the_shipped_policies_are_those_of_a_recorded_row(task):
     assert (card["command"], card["decorated_success"], card["episodes"]) == (row.command, row.decorated_success, row.episodes)
     assert row.env_steps >= online_config(task, "lesson").total_steps
     assert table.base_success.nunique() == 1 and 0.2 <= row.base_success <= 0.8 and (table.episodes == 200).all()
-    assert (table.decorated_success > table.base_success + 0.15).all()
+    assert (table.decorated_success > table.base_success + 0.15).all() == (task not in NOT_REPAIRED)
