@@ -8,7 +8,7 @@ import torch
 from pdkit.demos.format import from_episodes
 from pdkit.errors import PdkitError
 from pdkit.imitate import ImitateConfig, Windows, imitate
-from pdkit.policies import BeT, load_policy, save_policy
+from pdkit.policies import POLICIES, BeT, load_policy, save_policy
 from pdkit.policies.bet import focal_loss
 
 SMALL = dict(obs_dim=3, act_dim=2, window=4, bins=3, layers=2, heads=2, embed=16, features=16)
@@ -129,6 +129,16 @@ def test_imitation_learns(kind, config, lr):
     predicted = policy.act(observations.numpy())[:, 0, 0]
     assert (np.sign(predicted) == np.sign(actions[:, -1, 0].numpy())).mean() > 0.95
     assert len(history) == 1 and history[0]["loss"] < 5
+
+
+def test_the_normaliser_has_a_floor_where_it_is_asked_for():
+    """Columns: never moves, moves by 0.01, moves by 2; mean 5 each."""
+    observations = (5 + np.array([[0, 0.01, 2], [0, -0.01, -2]])).astype(np.float32)
+    for floor, expected in ((0.0, [1, 0.01, 2]), (0.5, [1, 0.5, 2])):
+        policy = POLICIES["mlp"]({"obs_dim": 3, "act_dim": 1, "std_floor": floor})
+        policy.fit_statistics(observations, np.zeros((2, 1)))
+        assert policy.normalizer.std.tolist() == pytest.approx(expected, rel=1e-3) and policy.normalizer.mean.tolist() == [5, 5, 5]
+    assert policy.normalizer(torch.tensor([[5.0, 5.25, 9.0]])).tolist() == [pytest.approx([0, 0.5, 2])]
 
 
 def test_save_and_load(tmp_path):

@@ -25,11 +25,15 @@ class Normalizer(nn.Module):
         self.register_buffer("std", torch.ones(dim))
 
     @torch.no_grad()
-    def fit(self, observations: np.ndarray) -> None:
-        """From observations (N, dim). A dimension that never varies is passed through unscaled."""
+    def fit(self, observations: np.ndarray, floor: float = 0.0) -> None:
+        """From observations (N, dim). A dimension that never varies is passed through unscaled.
+
+        No deviation is taken to be below `floor`: joints that the demonstrations hardly move would otherwise be what a policy sees
+        best, and lead it astray as soon as they move a little more.
+        """
         std = observations.std(axis=0)
         self.mean.copy_(torch.from_numpy(observations.mean(axis=0)))
-        self.std.copy_(torch.from_numpy(np.where(std < 1e-4, 1.0, std)))
+        self.std.copy_(torch.from_numpy(np.where(std < 1e-4, 1.0, np.maximum(std, floor))))
 
     def forward(self, observations: torch.Tensor) -> torch.Tensor:
         return (observations - self.mean) / self.std
