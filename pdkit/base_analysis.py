@@ -39,7 +39,7 @@ class Family:
     def settings(self, checkpoints: int, episodes: int, steps: int = 0, seed: int = 0) -> ImitateConfig:
         """Its training with so many checkpoints, each tested on `episodes` selection episodes; `steps` 0: its own number."""
         steps = steps or self.steps
-        own = POLICIES[self.kind].training | self.training
+        own = POLICIES[self.kind].recipe | self.training
         return replace(ImitateConfig(**own), iterations=steps, eval_every=max(1, steps // checkpoints), eval_episodes=episodes, seed=seed)
 
 

@@ -287,6 +287,42 @@ def lookup(answer: Callable, strict: bool = False) -> bool:
     return _judge("lookup", complaints, strict)
 
 
+def action_ascent(answer: Callable, strict: bool = False) -> bool:
+    """12: a sequence (horizon, act_dim) whose `executed` part climbed a value by plain gradient steps, clamped to [-1, 1] after each."""
+    def complaints() -> Iterator[str]:
+        goal = torch.tensor([[0.3, 1.4], [-0.2, 0.6]])
+        start, executed = torch.linspace(-0.8, 0.6, 10).view(5, 2), slice(1, 3)
+
+        def value(actions: torch.Tensor) -> torch.Tensor:
+            return -(actions - goal).square().sum()
+
+        def climbed(steps: int, sign: float = 1.0, clamp: str = "each") -> torch.Tensor:
+            moved = start.clone()
+            for _ in range(steps):
+                moved[executed] += sign * 0.2 * -2 * (moved[executed] - goal)
+                moved = moved.clamp(-1, 1) if clamp == "each" else moved
+            return moved.clamp(-1, 1) if clamp == "last" else moved
+
+        given = start.clone()
+        got = torch.as_tensor(answer(value, given, executed, 3, 0.2)).detach()
+        if got.shape != start.shape:
+            yield f"it gives shape {tuple(got.shape)}, not {tuple(start.shape)}: the whole sequence, with its executed part moved."
+        if not torch.equal(given, start):
+            yield "it changes the sequence that it was given; work on a copy (clone)."
+        if not torch.equal(got[[0, 3, 4]], start[[0, 3, 4]]):
+            yield "actions outside the executed part moved: the critic knows nothing of them."
+        if torch.allclose(got, start):
+            yield "nothing moves: is the gradient taken for the executed part, and added?"
+        if not torch.allclose(got, climbed(3), atol=1e-5):
+            mistakes = ((climbed(3, sign=-1.0), "it goes down: add the gradient."),
+                        (climbed(3, clamp="no"), "actions leave [-1, 1]: clamp them."),
+                        (climbed(1), "that is one step; take all of them, each with a new gradient."))
+            yield next((said for wrong, said in mistakes if torch.allclose(got, wrong, atol=1e-5)),
+                       f"after 3 steps of 0.2 the first executed number is {float(got[1, 0]):.3f}, not {float(climbed(3)[1, 0]):.3f}.")
+
+    return _judge("action_ascent", complaints, strict)
+
+
 def ranking(answer: Callable, recorded: Mapping[str, float], strict: bool = False) -> bool:
     """13: the recipes of `recorded` (recipe -> mean success) in the order predicted, best first; pairs closer than 10 points are ties."""
     def complaints() -> Iterator[str]:

@@ -219,6 +219,16 @@ def test_other_base_policies(tmp_path):
     assert (tmp_path / "gains.png").exists() and result["exercise_solved"] is False
 
 
+def test_finetuning_diffusion(tmp_path):
+    result = run("12", tmp_path, own_method="dipo")
+    assert set(result["reached"]) == {"a slope", "a plateau"} and result["adapters"]["8"] < result["adapters"]["0"] == 1_201_796
+    passes = {name: cost["passes"] for name, cost in result["costs"].items()}
+    assert passes["Policy Decorator"] == 0 < passes["DPPO"] == 1 < 4 < passes["DIPO"] < 5
+    assert result["own"]["method"] == "dipo" and result["own"]["steps"] >= 600 and len(result["claims"]) == 4
+    assert result["own"]["verdicts"].keys() == {"success", "success_at_end"} and (tmp_path / "costs.csv").exists()
+    assert result["exercise_solved"] is False
+
+
 def test_novel_objects_lesson(tmp_path):
     result = run("14_novel_objects", tmp_path)
     assert result["episodes"] == 4 and result["verdict"] == "untested"  # twelve steps solve nothing

@@ -2,6 +2,7 @@
 import numpy as np
 import pandas as pd
 import pytest
+from worlds import TwoAtOnce
 
 from pdkit import check, plots_residual, report, stats, verdicts
 from pdkit import residual_analysis as analysis
@@ -32,6 +33,12 @@ def test_random_residuals_keep_bound_and_gate(alpha, H, step, share):
         assert apart[on].mean() == pytest.approx(alpha / 2, rel=0.05)  # uniform: as in the loop
     policy.reset(3)
     assert np.array_equal(policy.act(windows)[:, 0], actions)
+
+
+def test_a_policy_that_acts_in_chunks_is_refused():
+    base = TwoAtOnce(dict(obs_dim=4, act_dim=2, kind="zero"))
+    with pytest.raises(PdkitError, match="probe policy decides on 2 at once"):
+        analysis.Disturbed(base, DecoratorConfig(alpha=0.3), 0)
 
 
 class Runner:
