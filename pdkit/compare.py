@@ -22,6 +22,8 @@ from .errors import PdkitError
 from .methods import METHODS
 from .methods.ppo import OnPolicy
 from .methods.registry import base_folder, get_method, method_config, trainer_of
+from .pixels.pictures import encoded, pictures_of
+from .pixels.task import encoder_of
 from .plots_compare import labelled, over_seeds
 from .policies import load_policy
 from .policies.base import read_card
@@ -186,14 +188,14 @@ def budgets(table: pd.DataFrame, labels: Mapping[str, str]) -> pd.DataFrame:
 
 # ---- a run of the reader's own ---------------------------------------------------------------------------------------
 
-def own_run(method: str, task: str, profile: str, seed: int, folder: Path, episodes: int, recipe: str = "", **changes: Any
-            ) -> tuple[pd.DataFrame, pd.DataFrame]:
+def own_run(method: str, task: str, profile: str, seed: int, folder: Path, episodes: int, recipe: str = "", pixels: bool = False,
+            **changes: Any) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Train one method once, below `folder`, and return its row and its curve in the form of recorded ones, as `recipe` (the method).
 
-    A finished run with the same settings is read, an interrupted one goes on. Raises PdkitError for an unknown method or setting, and
-    where the policy is missing that the method starts from.
+    With `pixels` it starts from the shipped visual policy. A finished run with the same settings is read, an interrupted one goes on.
+    Raises PdkitError for an unknown method or setting, and where the policy is missing that the method starts from.
     """
-    config, start = method_config(method, task, profile, seed, **changes), base_folder(method, task)
+    config, start = method_config(method, task, profile, seed, **changes), base_folder(method, task, pixels)
     if not start.exists():
         raise PdkitError(f"{get_method(method).title} starts from a policy that does not come with the kit for {task} "
                          f"({start.name}); choose another method or task.")
@@ -204,7 +206,9 @@ def own_run(method: str, task: str, profile: str, seed: int, folder: Path, episo
     mark = hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:8]
     run = Run(folder / f"{method}-seed{seed}-{mark}", "decorated", settings)
     if not run.finished or run.manifest["results"]["episodes"] != episodes:
-        decorate(config, load_policy(start), demos, run.folder, episodes, origin(card, demos))
+        encoder = encoder_of(start)
+        seen = encoded(demos, pictures_of(demos), encoder) if encoder and demos else demos
+        decorate(config, load_policy(start), seen, run.folder, episodes, origin(card, demos), encoder=encoder)
         run = Run(run.folder, "decorated", settings)
     labels = {"task": task, "recipe": recipe or method, "seed": seed}
     return pd.DataFrame([run.manifest["results"] | labels]), pd.read_csv(run.folder / "metrics.csv").assign(**labels)

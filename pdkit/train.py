@@ -19,7 +19,7 @@ from .decorated import Decorated
 from .demos import Demos, load_demos, sources
 from .errors import PdkitError, unknown
 from .evaluate import evaluate
-from .files import DATA, atomic_file, runs_root
+from .files import atomic_file, runs_root
 from .imitate import ImitateConfig, imitate
 from .methods import METHODS
 from .methods.registry import base_folder as shipped_base
@@ -132,8 +132,7 @@ def _base(args) -> int:
 def _decorated(args) -> int:
     settings = parse_settings(args.set)
     get_task(args.task)
-    base_folder = Path(args.base) if args.base else (DATA / "checkpoints" / args.task / "pixels" if args.pixels else
-                                                     shipped_base(args.method, args.task))
+    base_folder = Path(args.base) if args.base else shipped_base(args.method, args.task, args.pixels)
     encoder = encoder_of(base_folder)
     if args.pixels and not encoder:
         raise PdkitError(f"There is no visual policy in {base_folder}; train one with `pdkit train base {args.task} --policy mlp --pixels` "
@@ -149,9 +148,9 @@ def _decorated(args) -> int:
         print(f"{args.task}, seed {seed}: " + str(differences(config, args.profile) or "the profile unchanged"), flush=True)
         out = Path(args.out or runs_root() / "train") / f"{args.task}-{args.recipe}-seed{seed}"
         demos = base_demos(args) if config.demo_fraction or trainer_of(args.method).needs_demos else None
+        started_from = origin(read_card(base_folder), demos)
         if encoder and demos:
             demos = encoded(demos, pictures_of(demos), encoder)
-        started_from = origin(read_card(base_folder), demos)
         row = decorate(config, base, demos, out, args.episodes, started_from, args.tensorboard, encoder)
         row |= {"recipe": args.recipe, "command": command_of(args, seed)}
         print(", ".join(f"{k} {v}" for k, v in row.items()), flush=True)

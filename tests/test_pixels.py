@@ -303,9 +303,9 @@ def test_what_only_pictures_show_is_learned(monkeypatch):
     demos = Demos("lever", "scripted", "test", "-", side.repeat(2, axis=0), side, np.ones(12, bool), np.ones(12, np.int64), np.arange(12))
     view = View("lever", ("front",), 64, 64, False, ((0, 0),), 2)
     pictures = draw(demos, spec=PROBES["lever"], view=view)
-    config = ImitateConfig(iterations=30, batch=16, eval_every=30, eval_episodes=8, bf16=False)
+    config = ImitateConfig(iterations=60, batch=16, lr=3e-3, eval_every=60, eval_episodes=8, bf16=False)
     _, _, history = imitate_pixels("mlp", demos, pictures, config, {"hidden": 16}, spec=PROBES["lever"], view=view)
-    assert history[-1]["success_once"] == 1.0  # blind, half
+    assert history[-1]["success_once"] == 1.0, history  # blind, half
 
 
 def test_a_visual_policy_on_disk(sighted, tmp_path):
@@ -330,7 +330,7 @@ def test_the_derived_task_is_one_like_any_other(sighted, tmp_path, painted):
                            eval_episodes=2, log_every=40, checkpoint_every=80, alpha_scale=(), train_limit=0, bf16=False, n_step=2)
     whole = Trainer(config, policy, seen, spec=spec)
     whole.train()
-    assert whole.replay.rows.shape[1] == 2 * 258 + 3 * 2 + 2 and whole.demos.size > 100
+    assert whole.replay.rows.shape[1] == 2 * 258 + 3 * 2 + 2 and whole.demos.size == len(seen.actions)
 
     def stop(trainer):
         if trainer.step >= 120:

@@ -33,9 +33,9 @@ def method_config(method: str, task: str, profile: str = "lesson", seed: int = 0
     return online_config(task, profile, seed, **({"method": method} | over | own | changes))
 
 
-def base_folder(method: str, task: str) -> Path:
-    """Where the shipped policy lies that a method starts from."""
-    return DATA / "checkpoints" / task / get_method(method).base
+def base_folder(method: str, task: str, pixels: bool = False) -> Path:
+    """Where the shipped policy lies that a method starts from; with `pixels` the one that sees pictures."""
+    return DATA / "checkpoints" / task / ("pixels" if pixels else get_method(method).base)
 
 
 def make_trainer(config: OnlineConfig, base: Policy, demos: Demos | None = None, spec: TaskSpec | None = None) -> Trainer:

@@ -31,7 +31,8 @@ class PixelSim:
     def __init__(self, spec: TaskSpec, view: View | None = None):
         self.view = view or view_of(spec.name)
         # A ManiSkill scene is built with or without what can be drawn; a MuJoCo one can be drawn by whoever reads its data.
-        self._sim = spec.make(render=True) if spec.suite == "maniskill" else spec.make()
+        drawing = {"cameras" if spec.plan_view else "render": True} if spec.suite == "maniskill" else {}
+        self._sim = spec.make(**drawing)
         self._eyes = EYES[spec.suite](self.view, self._sim)
 
     def reset(self, seed: int) -> Frame:

@@ -25,7 +25,7 @@ from mani_skill.utils.structs.types import DefaultMaterialsConfig, SceneConfig, 
 from ..errors import PdkitError
 from .chair_assets import SCALE, Chair
 from .chair_body import CLOSE, HZ, STILL, UPRIGHT, ChairBody, chair_start
-from .maniskill_headless import without_materials
+from .maniskill import building
 from .mobile_panda import ACTING, ARM_REST, BASE_JOINTS, CONTROL, FINGERS, JOINTS, SIDES, TIPS, arm_joints, finger_joints, joint_order
 from .partnet import link_parts
 
@@ -67,7 +67,7 @@ class PushChairEnv(BaseEnv):
     SUPPORTED_REWARD_MODES = ("sparse", "none")
 
     def __init__(self, *args: Any, chairs: Sequence[Chair], **kwargs: Any):
-        self._chairs = chairs
+        self._chairs, self._drawn = chairs, kwargs.get("render_backend") != "none"
         super().__init__(*args, robot_uids=MobilePandaDualArm.uid, reconfiguration_freq=1, **kwargs)
 
     @property
@@ -77,7 +77,7 @@ class PushChairEnv(BaseEnv):
             default_materials_config=DefaultMaterialsConfig(static_friction=0.5, dynamic_friction=0.5, restitution=0))
 
     def _reconfigure(self, options: dict) -> None:
-        with without_materials():
+        with building(self._drawn):
             super()._reconfigure(options)
 
     def _load_agent(self, options: dict) -> None:
