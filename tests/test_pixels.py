@@ -5,11 +5,12 @@ import pickle
 import sys
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 from worlds import reach_demos
 
-from pdkit import cli
+from pdkit import check, cli, pixel_analysis, plots_pixels
 from pdkit.demos import Demos, sources
 from pdkit.errors import PdkitError
 from pdkit.imitate import ImitateConfig
@@ -378,3 +379,91 @@ def test_from_the_command_line(monkeypatch, tmp_path, capsys):
     assert call("train", "decorated", "Door", "--pixels", "--base", "data/checkpoints/Door/base") == 2
     assert "no visual policy in data/checkpoints/Door/base" in capsys.readouterr().err
     assert call("demos", "--pixels") == 2
+
+
+# ---- what notebook 15 measures ---------------------------------------------------------------------------------------
+
+def test_what_a_buffer_weighs():
+    """Door, 1,000 transitions: two frames of 128 x 128 x 3 bytes, or of 256 floats, and 27 joints of four bytes with either."""
+    door = view_of("Door")
+    assert pixel_analysis.buffer_bytes(door, 1_000, False) == 2_000 * (49_152 + 108)
+    assert pixel_analysis.buffer_bytes(door, 1_000, True) == 2_000 * (1_024 + 108)
+    table = pixel_analysis.memory(["Door", "PushChair"], 1_000)
+    assert table.times.tolist() == pytest.approx([49_260 / 1_132, (50 * 125 * 15 + 272) / (1_024 + 272)])
+    assert plots_pixels.memory_figure(table, 1_000).png()
+
+
+class Told(torch.nn.Module):
+    """An encoder whose features are the mean of the picture and its square."""
+
+    view = REACH
+
+    def encode(self, rgb, depth):
+        mean = rgb.mean(axis=(1, 2, 3))[:, None].astype(np.float32)
+        return np.concatenate([mean, mean**2], axis=1)
+
+
+def _levels(demos):
+    """A picture for each observation: everywhere 50 + 50 times the number at place 2."""
+    level = (50 + 50 * demos.observations[:, 2]).astype(np.uint8)
+    return kept.Pictures(np.broadcast_to(level[:, None, None, None], (len(level), 3, 4, 4)), np.empty((len(level), 0, 4, 4), np.uint16))
+
+
+def test_what_a_picture_is_worth():
+    """A policy that returns the first feature is right with its own picture, wrong with another's and off by all of it with a black one."""
+    demos = reach_demos(3)
+    pictures = _levels(demos)
+    own = pictures.rgb[:, 0, 0, 0].astype(np.float32)
+    starts = np.concatenate([[0], np.cumsum(demos.lengths + 1)])
+    acted = np.concatenate([own[a: b - 1] for a, b in zip(starts, starts[1:], strict=False)])
+    demos = dataclasses.replace(demos, actions=np.stack([acted, acted], axis=1))
+
+    class Copy:
+        window = 1
+
+        def act(self, windows):
+            return windows[:, :, 2:3].repeat(2, axis=2)
+
+    worth = pixel_analysis.errors(Copy(), Told(), demos, pictures)
+    goals = own[starts[:-1]]
+    others = np.repeat(goals[[1, 2, 0]] - goals, demos.lengths)
+    assert worth["its own"] == 0 and worth["another episode's"] == pytest.approx(np.sqrt((others**2).mean()), rel=1e-4)
+    assert worth["black"] == pytest.approx(np.sqrt((acted**2).mean()), rel=1e-5)
+
+
+def test_a_probe_tells_what_the_features_hold():
+    demos = reach_demos(12)
+    pictures = _levels(demos)
+    assert pixel_analysis.probe(Told(), demos, pictures, slice(2, 3), 8) > 0.99
+    assert pixel_analysis.probe(Told(), demos, pictures, slice(3, 4), 8) < 0.6  # the goal's other coordinate is not in the picture
+    with pytest.raises(PdkitError, match="1 to 11 of them, not on 12"):
+        pixel_analysis.probe(Told(), demos, pictures, slice(2, 3), 12)
+
+
+def test_blindfolded_the_features_stand_still(sighted):
+    policy, _, seen = sighted
+    states = np.random.default_rng(0).normal(size=(4, 1, 4)).astype(np.float32)
+    expected = np.concatenate([states[:, :, :2], np.tile(seen.observations[:, 2:].mean(0), (4, 1, 1))], axis=2).astype(np.float32)
+    np.testing.assert_allclose(pixel_analysis.blindfolded(policy, REACH)(states), policy.act(expected), atol=1e-4)
+
+
+def test_the_verdict_is_partly_at_most():
+    row = dict(episodes=40, base_success=0.375)
+    assert pixel_analysis.verdict(pd.Series(row | {"decorated_success": 0.975})) == "partly"
+    assert pixel_analysis.verdict(pd.Series(row | {"decorated_success": 0.45})) == "not"  # its interval reaches below the base
+
+
+def test_the_exercise(capsys):
+    assert check.shift(pixel_analysis.shifted)
+    wrong = {lambda p, d, r: np.roll(p, (d, r), (0, 1)): "np.roll", lambda p, d, r: pixel_analysis.shifted(p, -d, -r): "other way",
+             lambda p, d, r: pixel_analysis.shifted(p, r, d): "exchanged", lambda p, d, r: p[1:]: "size must stay"}
+    for answer, hint in wrong.items():
+        assert not check.shift(answer) and hint in capsys.readouterr().out
+
+
+def test_figures_of_views_and_shifts():
+    frames = {"StackCube": pixel_sim.Frame(np.zeros((6, 64, 64), np.uint8), np.zeros((2, 64, 64), np.uint16), np.zeros(32)),
+              "Door": pixel_sim.Frame(np.zeros((3, 128, 128), np.uint8), np.zeros((0, 128, 128), np.uint16), np.zeros(27))}
+    assert plots_pixels.views_figure(frames).png()
+    picture = np.zeros((8, 8, 3), np.uint8)
+    assert plots_pixels.shift_figure(picture, [picture, picture], 2).png()

@@ -46,8 +46,9 @@ class SapienEyes:
 def _camera(env: Any, view: View, name: str) -> Any:
     """A camera of this name, in the scene."""
     import sapien
+    from mani_skill.render.shaders import PREBUILT_SHADER_CONFIGS, set_shader_pack
 
-    sapien.render.set_camera_shader_dir("minimal")  # colours as bytes, places in millimetres: ManiSkill's own choice for observations
+    set_shader_pack(PREBUILT_SHADER_CONFIGS["minimal"])  # colours as bytes, places in millimetres: ManiSkill's choice for observations
     camera = sapien.render.RenderCameraComponent(view.width, view.height)
     mast = name.startswith("mast")
     camera.set_fovy(np.pi / 3 if mast else np.pi / 2, compute_x=True)

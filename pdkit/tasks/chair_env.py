@@ -6,7 +6,10 @@ the same scene without torch. Importing this module imports ManiSkill.
 """
 from __future__ import annotations
 
-from collections.abc import Sequence
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, nullcontext
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -59,6 +62,20 @@ class MobilePandaDualArm(BaseAgent):
         return {CONTROL: parts}
 
 
+@contextmanager
+def _drawn_description() -> Iterator[None]:
+    """Within this block the robot is described with meshes that can be drawn: the wheel's URDF names .dae files, and has .glb ones."""
+    folder, original = Path(MobilePandaDualArm.urdf_path).parent, MobilePandaDualArm.urdf_path
+    text = Path(original).read_text().replace(".dae", ".glb").replace('filename="', f'filename="{folder}/')
+    with tempfile.TemporaryDirectory() as temporary:
+        MobilePandaDualArm.urdf_path = f"{temporary}/drawn.urdf"
+        Path(MobilePandaDualArm.urdf_path).write_text(text)
+        try:
+            yield
+        finally:
+            MobilePandaDualArm.urdf_path = original
+
+
 @register_env(NAME, max_episode_steps=200)
 class PushChairEnv(BaseEnv):
     """Push the chair to the origin. A reset builds the scene anew, with the chair that the seed picks out of `chairs`."""
@@ -81,7 +98,8 @@ class PushChairEnv(BaseEnv):
             super()._reconfigure(options)
 
     def _load_agent(self, options: dict) -> None:
-        super()._load_agent(options, sapien.Pose())
+        with _drawn_description() if self._drawn else nullcontext():
+            super()._load_agent(options, sapien.Pose())
         self.agent.robot.links_map["adjustable_body"].set_collision_group_bit(2, TORSO, 1)
         self._order = joint_order(self.agent.robot)
 
