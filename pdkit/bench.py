@@ -15,7 +15,10 @@ import torch
 
 from .cli import Parser
 from .decorator import DecoratorConfig, critic_features
+from .demos import Demos
+from .demos.sources import bundled
 from .files import DATA, write_json
+from .imitate import ImitateConfig, Windows, gradient_step, make_optimizer
 from .policies import POLICIES
 from .profiles import online_config
 from .rl.replay import Replay
@@ -181,9 +184,36 @@ def bench_base(seconds: float) -> dict[str, Any]:
         *(lambda n=name: len(policies[n].act(windows[n])) for name in ("bet", "mlp")), seconds)}
 
 
+def imitator(kind: str, demos: Demos, batch: int, device: str, shipped: bool) -> Callable[[], int]:
+    """One call makes a gradient step of imitation: the shipped path, or a plain float32 loop with AdamW one tensor at a time."""
+    spec, config = get_task(demos.task), ImitateConfig(batch=batch)
+    policy = POLICIES[kind](dict(obs_dim=spec.obs_dim, act_dim=spec.act_dim, **POLICIES[kind].for_task(spec)))
+    policy.fit_statistics(demos.observations, demos.actions)
+    policy.to(device).train()
+    groups = policy.parameter_groups(config.weight_decay)
+    optimizer = make_optimizer(policy, config) if shipped else torch.optim.AdamW(groups, lr=config.lr, foreach=False)
+    windows, generator = Windows(demos, policy.window, True, policy.horizon, spec.resting), torch.Generator().manual_seed(0)
+
+    def work() -> int:
+        gradient_step(policy, optimizer, *(x.to(device) for x in windows.sample(batch, generator)), shipped)
+        if device == "cuda":
+            torch.cuda.synchronize()
+        return 1
+
+    return work
+
+
+def bench_imitation(seconds: float, device: str) -> dict[str, Any]:
+    """Gradient steps of every base policy that learns by them, at its default size on StackCube, against float32 eager."""
+    demos, out = bundled("StackCube"), {}
+    for kind in (kind for kind, policy in POLICIES.items() if policy.learns):
+        sides = (imitator(kind, demos, 256, device, shipped) for shipped in (True, False))
+        out[f"imitation of {kind}, shipped / float32 eager, batch 256 (gradient steps/s)"] = paired(*sides, seconds)
+    return out
+
+
 def profile_costs(steps: dict[str, dict[str, Any]], task: str) -> dict[str, Any]:
     """What a profile costs: milliseconds an environment step and hours for its whole budget, measured from a short run each."""
-    from .demos import sources
     from .online import Trainer
     from .policies import load_policy
 
@@ -192,7 +222,7 @@ def profile_costs(steps: dict[str, dict[str, Any]], task: str) -> dict[str, Any]
         whole = online_config(task, profile)
         config = online_config(task, profile, **short)
         trainer = Trainer(config, load_policy(DATA / "checkpoints" / task / "base"),
-                          sources.bundled(task) if config.demo_fraction else None)
+                          bundled(task) if config.demo_fraction else None)
         trainer.train()
         # Only the steps during which the learner works count: the warm-up costs next to nothing.
         learned = trainer.step - config.warmup_steps
@@ -217,7 +247,8 @@ def main(argv: list[str]) -> int:
     print(f"About {'1 minute' if args.quick else '5 minutes'}; {args.threads} thread(s), bfloat16 in hardware: {has_bf16(device)}, "
           f"updates on {device}.", flush=True)
     results: dict[str, Any] = {}
-    for part in (lambda: bench_step(seconds), lambda: bench_updates(seconds, device), lambda: bench_base(seconds)):
+    for part in (lambda: bench_step(seconds), lambda: bench_updates(seconds, device), lambda: bench_base(seconds),
+                 lambda: bench_imitation(seconds, device)):
         for name, values in part().items():
             results[name] = values
             print(f"{name}\n    {values['first_per_s']:.0f} / {values['second_per_s']:.0f} = {values['ratio']:.2f} "

@@ -16,10 +16,10 @@ import pandas as pd
 
 from .cli import Parser
 from .decorated import Decorated
-from .demos import Demos, load_demos, sources
+from .demos import Demos, sources
 from .errors import PdkitError, unknown
 from .evaluate import evaluate
-from .files import atomic_file, runs_root
+from .files import DATA, atomic_file, runs_root
 from .imitate import ImitateConfig, imitate
 from .methods import METHODS
 from .methods.registry import base_folder as shipped_base
@@ -90,10 +90,7 @@ def parse_settings(settings: list[str]) -> dict[str, Any]:
 
 def base_demos(args) -> Demos:
     """The demonstrations that the arguments name."""
-    wanted = get_task(args.task).demo_task or args.task
-    demos = load_demos(args.demos) if args.demos else sources.bundled(args.task)
-    if demos.task != wanted:
-        raise PdkitError(f"{args.demos} holds demonstrations of {demos.task}, not of {wanted}.")
+    demos = sources.given(args.task, args.demos) if args.demos else sources.bundled(args.task)
     return demos.first(args.num_demos) if args.num_demos is not None else demos
 
 
@@ -107,7 +104,7 @@ def _base(args) -> int:
     for name in settings:
         if name not in fields | set(architecture):
             raise unknown("field", name, fields | set(POLICIES[args.policy].defaults))
-    config = checked(ImitateConfig, POLICIES[args.policy].training | {k: v for k, v in settings.items() if k in fields})
+    config = checked(ImitateConfig, POLICIES[args.policy].recipe | {k: v for k, v in settings.items() if k in fields})
     out = Path(args.out) if args.out else runs_root() / "base" / f"{args.task}-{args.policy}{'-pixels' if args.pixels else ''}"
     print(f"{args.policy} on {demos.num} demonstrations of {args.task} ({demos.label}): {config}", flush=True)
 
@@ -132,7 +129,8 @@ def _base(args) -> int:
 def _decorated(args) -> int:
     settings = parse_settings(args.set)
     get_task(args.task)
-    base_folder = Path(args.base) if args.base else shipped_base(args.method, args.task, args.pixels)
+    visual = DATA / "checkpoints" / args.task / "pixels"
+    base_folder = Path(args.base) if args.base else visual if args.pixels else shipped_base(args.method, args.task)
     encoder = encoder_of(base_folder)
     if args.pixels and not encoder:
         raise PdkitError(f"There is no visual policy in {base_folder}; train one with `pdkit train base {args.task} --policy mlp --pixels` "

@@ -5,8 +5,11 @@ import numpy as np
 import pytest
 import torch
 
-from pdkit.bench import EagerSAC, paired, updater
+from pdkit.bench import EagerSAC, imitator, paired, updater
 from pdkit.decorator import DecoratorConfig
+from pdkit.demos.sources import bundled
+from pdkit.imitate import ImitateConfig, Windows, gradient_step, make_optimizer
+from pdkit.policies import MLP
 from pdkit.rl.sac import SAC, SACConfig
 
 
@@ -35,3 +38,23 @@ def test_the_eager_reference_and_the_shipped_path_make_the_same_update():
         assert torch.allclose(ours, theirs, atol=2e-5), part
     assert agents[0].log_temperature.item() == pytest.approx(agents[1].log_temperature.item(), abs=1e-5)
     assert np.isfinite(agents[0].log_temperature.item())
+
+
+def test_imitation_is_timed_with_the_same_gradient_step_on_both_sides():
+    demos, batch = bundled("StackCube").first(10), 32
+    ends = []
+    for one_kernel in (True, False):
+        torch.manual_seed(0)
+        policy = MLP(dict(obs_dim=55, act_dim=4, hidden=16)).train()
+        policy.fit_statistics(demos.observations, demos.actions)
+        groups = policy.parameter_groups(0.0)
+        optimizer = make_optimizer(policy, ImitateConfig(weight_decay=0.0)) if one_kernel else \
+            torch.optim.AdamW(groups, lr=ImitateConfig().lr, foreach=False)
+        windows = Windows(demos, 1, True)
+        before = torch.nn.utils.parameters_to_vector(policy.parameters()).detach().clone()
+        gradient_step(policy, optimizer, *windows.sample(batch, torch.Generator().manual_seed(1)), bf16=False)
+        ends.append(torch.nn.utils.parameters_to_vector(policy.parameters()).detach())
+        assert not torch.equal(ends[-1], before)
+    assert torch.allclose(*ends, atol=1e-6)
+    for shipped in (True, False):
+        assert imitator("mlp", demos, batch, "cpu", shipped)() == 1

@@ -12,6 +12,7 @@ from torch import nn
 from ..errors import PdkitError, unknown
 from ..files import atomic_folder, read_json, sha256, write_json
 from ..tasks.spec import TaskSpec
+from .settings import checked_settings
 
 FORMAT = "pdkit-policy-1"
 
@@ -46,12 +47,15 @@ class Policy(nn.Module):
     window = 1  # observations it looks at
     chunk = 1  # primitive actions it returns
     horizon = 0  # actions it learns from the first observation of a window on; 0: one for each observation
-    training: dict[str, Any] = {}  # how it is trained where that differs from the defaults of ImitateConfig
+    recipe: dict[str, Any] = {}  # how it is trained where that differs from the defaults of ImitateConfig
     learns = True  # by gradient steps on `loss`; otherwise `remember` is all there is
+    defaults: dict[str, Any] = {}  # of its settings; each must be of its default's type
+    least: dict[str, float] = {}  # the least values of settings, where not the usual ones (settings.py)
 
     def __init__(self, config: dict[str, Any]):
         super().__init__()
-        self.config = config  # everything its constructor needs, JSON types only
+        # Everything its constructor needs, JSON types only.
+        self.config = checked_settings(self.kind, self.defaults | config, self.defaults, self.least)
 
     @classmethod
     def for_task(cls, spec: TaskSpec) -> dict[str, Any]:
