@@ -467,3 +467,6 @@ def test_figures_of_views_and_shifts():
     assert plots_pixels.views_figure(frames).png()
     picture = np.zeros((8, 8, 3), np.uint8)
     assert plots_pixels.shift_figure(picture, [picture, picture], 2).png()
+    curves = pd.DataFrame({"recipe": "a", "step": [10, 20], "train_success": [0.5, np.nan], "success_once": [np.nan, 1.0]})
+    figure = plots_pixels.training_figure(curves, {"a": "A", "b": "none"}, base=0.4)
+    assert figure.png() and list(figure.axes[0].lines[0].get_xdata()) == [10]
