@@ -129,7 +129,7 @@ def _base(args) -> int:
 def _decorated(args) -> int:
     settings = parse_settings(args.set)
     get_task(args.task)
-    visual = DATA / "checkpoints" / args.task / "pixels"
+    visual = DATA / "checkpoints" / args.task / "pixels" / "base"
     base_folder = Path(args.base) if args.base else visual if args.pixels else shipped_base(args.method, args.task)
     encoder = encoder_of(base_folder)
     if args.pixels and not encoder:
@@ -201,7 +201,7 @@ def decorate(config, base: Policy, demos: Demos | None, out: Path, episodes: int
     run.write_metrics(trainer.rows)
     trainer.save_policy(policy, out / "decorated")
     if encoder:
-        save_encoder(encoder, out / "decorated" / ENCODER)
+        save_encoder(encoder, out / "decorated" / "base" / ENCODER)
     tables = {"base": _base_episodes(base, trainer.spec, episodes, config, started_from["base"]),
               "decorated": _episodes(policy, trainer.spec, episodes)}
     for name, table in tables.items():

@@ -73,8 +73,9 @@ def pixel_spec(spec: TaskSpec, encoder: Encoder) -> TaskSpec:
 
 
 def encoder_of(folder: str | Path) -> Encoder | None:
-    """The encoder that a policy in `folder` sees through; None for one that is told the state."""
-    return load_encoder(Path(folder) / ENCODER) if (Path(folder) / ENCODER).is_dir() else None
+    """The encoder that a policy in `folder` (for a decorated one: its base policy) sees through; None for one that is told the state."""
+    found = [path for path in (Path(folder) / ENCODER, Path(folder) / "base" / ENCODER) if path.is_dir()]
+    return load_encoder(found[0]) if found else None
 
 
 def save_visual(policy: Policy, encoder: Encoder, folder: str | Path, info: dict[str, Any]) -> None:
