@@ -237,11 +237,12 @@ def test_finetuning_diffusion(tmp_path):
     assert result["exercise_solved"] is False
 
 
-def test_novel_objects_lesson(tmp_path):
-    result = run("14_novel_objects", tmp_path)
+@pytest.mark.parametrize("task", ["TurnFaucet", "PushChair"])
+def test_novel_objects_lesson(tmp_path, task):
+    result = run("14_novel_objects", tmp_path, task=task)
     assert result["episodes"] == 4 and result["verdict"] == "untested"  # twelve steps solve nothing
     assert set(result["novel"]) == {"base", "decorated"} and result["hardest"] in result["novel"]["base"]
-    assert result["medians"]["novel"] > result["medians"]["source"] > 0 and 0 <= result["own_success"] <= 1
+    assert (result["medians"]["novel"] > result["medians"]["source"]) == (task == "TurnFaucet") and 0 <= result["own_success"] <= 1
 
 
 def test_interrupting_the_main_job_tells_how_to_go_on(monkeypatch, tmp_path, capsys):
