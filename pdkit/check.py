@@ -9,8 +9,9 @@ from collections.abc import Callable, Iterator, Mapping
 
 import numpy as np
 import torch
+from scipy import stats as scipy_stats
 
-from . import stats
+from . import base_analysis, stats
 from .errors import PdkitError
 from .policies import bet
 
@@ -96,6 +97,26 @@ def ddim_step(answer: Callable, strict: bool = False) -> bool:
                 yield f"with abar {here:g} and then {after:g} the first number is {got[0, 0]:.3f}, not {expected[0, 0]:.3f}."
 
     return _judge("ddim_step", complaints, strict)
+
+
+def best_of(answer: Callable, strict: bool = False) -> bool:
+    """04: what the best of m evaluations of n episodes shows on average, when every policy truly solves a share p: answer(p, n, m)."""
+    def complaints() -> Iterator[str]:
+        for p, n, m in ((0.5, 1, 2), (0.5, 50, 1), (0.3, 50, 10), (0.9, 20, 5)):
+            got, expected = float(answer(p, n, m)), base_analysis.best_of(p, n, m)
+            cdf = scipy_stats.binom.cdf(np.arange(n + 1), n, p)
+            if abs(got - expected) < 0.01:  # a simulation of some thousand draws is as good
+                continue
+            mistakes = {
+                p: "that is the truth itself: the best of several shows more, because its luck was chosen with it.",
+                n * expected: "that is a number of episodes, not a share: divide by n.",
+                float(np.sum(np.diff(cdf, prepend=0.0) ** m * np.arange(n + 1)) / n):
+                    "the chance that the best is k is F(k)^m - F(k - 1)^m: take the difference after the power, not before.",
+                float(1 - (1 - p) ** m): "that is the chance that one of m episodes is solved; an evaluation has n."}
+            yield next((said for value, said in mistakes.items() if abs(got - value) < 0.01),
+                       f"for p={p:g}, n={n} and m={m} it gives {got:.3f}, not {expected:.3f}.")
+
+    return _judge("best_of", complaints, strict)
 
 
 def gate(answer: Callable, strict: bool = False) -> bool:
@@ -264,6 +285,42 @@ def lookup(answer: Callable, strict: bool = False) -> bool:
                 yield f"with k={k} the first number is {got[0]:.3f}, not {expected[0]:.3f}."
 
     return _judge("lookup", complaints, strict)
+
+
+def action_ascent(answer: Callable, strict: bool = False) -> bool:
+    """12: a sequence (horizon, act_dim) whose `executed` part climbed a value by plain gradient steps, clamped to [-1, 1] after each."""
+    def complaints() -> Iterator[str]:
+        goal = torch.tensor([[0.3, 1.4], [-0.2, 0.6]])
+        start, executed = torch.linspace(-0.8, 0.6, 10).view(5, 2), slice(1, 3)
+
+        def value(actions: torch.Tensor) -> torch.Tensor:
+            return -(actions - goal).square().sum()
+
+        def climbed(steps: int, sign: float = 1.0, clamp: str = "each") -> torch.Tensor:
+            moved = start.clone()
+            for _ in range(steps):
+                moved[executed] += sign * 0.2 * -2 * (moved[executed] - goal)
+                moved = moved.clamp(-1, 1) if clamp == "each" else moved
+            return moved.clamp(-1, 1) if clamp == "last" else moved
+
+        given = start.clone()
+        got = torch.as_tensor(answer(value, given, executed, 3, 0.2)).detach()
+        if got.shape != start.shape:
+            yield f"it gives shape {tuple(got.shape)}, not {tuple(start.shape)}: the whole sequence, with its executed part moved."
+        if not torch.equal(given, start):
+            yield "it changes the sequence that it was given; work on a copy (clone)."
+        if not torch.equal(got[[0, 3, 4]], start[[0, 3, 4]]):
+            yield "actions outside the executed part moved: the critic knows nothing of them."
+        if torch.allclose(got, start):
+            yield "nothing moves: is the gradient taken for the executed part, and added?"
+        if not torch.allclose(got, climbed(3), atol=1e-5):
+            mistakes = ((climbed(3, sign=-1.0), "it goes down: add the gradient."),
+                        (climbed(3, clamp="no"), "actions leave [-1, 1]: clamp them."),
+                        (climbed(1), "that is one step; take all of them, each with a new gradient."))
+            yield next((said for wrong, said in mistakes if torch.allclose(got, wrong, atol=1e-5)),
+                       f"after 3 steps of 0.2 the first executed number is {float(got[1, 0]):.3f}, not {float(climbed(3)[1, 0]):.3f}.")
+
+    return _judge("action_ascent", complaints, strict)
 
 
 def ranking(answer: Callable, recorded: Mapping[str, float], strict: bool = False) -> bool:

@@ -186,25 +186,24 @@ def budgets(table: pd.DataFrame, labels: Mapping[str, str]) -> pd.DataFrame:
 
 # ---- a run of the reader's own ---------------------------------------------------------------------------------------
 
-def own_run(method: str, task: str, profile: str, seed: int, folder: Path, episodes: int, recipe: str = "", **changes: Any
-            ) -> tuple[pd.DataFrame, pd.DataFrame]:
+def own_run(method: str, task: str, profile: str, seed: int, folder: Path, episodes: int, recipe: str = "", base: Path | None = None,
+            **changes: Any) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Train one method once, below `folder`, and return its row and its curve in the form of recorded ones, as `recipe` (the method).
+    It starts from the policy in `base`, or from the shipped one that the method starts from.
 
     A finished run with the same settings is read, an interrupted one goes on. Raises PdkitError for an unknown method or setting, and
     where the policy is missing that the method starts from.
     """
-    config, start = method_config(method, task, profile, seed, **changes), base_folder(method, task)
-    if not start.exists():
-        raise PdkitError(f"{get_method(method).title} starts from a policy that does not come with the kit for {task} "
-                         f"({start.name}); choose another method or task.")
-    card = read_card(start)
+    start = base or base_folder(method, task)
+    card, policy = read_card(start), load_policy(start)
+    config = method_config(method, task, profile, seed, policy=policy, **changes)
     needed = config.demo_fraction or trainer_of(method).needs_demos
     demos = sources.bundled(task).first(card["info"]["demos"]) if needed else None
     settings = flat(config) | origin(card, demos)
     mark = hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:8]
     run = Run(folder / f"{method}-seed{seed}-{mark}", "decorated", settings)
     if not run.finished or run.manifest["results"]["episodes"] != episodes:
-        decorate(config, load_policy(start), demos, run.folder, episodes, origin(card, demos))
+        decorate(config, policy, demos, run.folder, episodes, origin(card, demos))
         run = Run(run.folder, "decorated", settings)
     labels = {"task": task, "recipe": recipe or method, "seed": seed}
     return pd.DataFrame([run.manifest["results"] | labels]), pd.read_csv(run.folder / "metrics.csv").assign(**labels)

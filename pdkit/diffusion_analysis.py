@@ -11,6 +11,7 @@ from .demos import Demos
 from .evaluate import evaluate
 from .policies import DiffusionPolicy, Policy
 from .probes import PROBES, ForkSim
+from .stats import paired
 from .tasks.spec import TaskSpec
 
 
@@ -93,17 +94,24 @@ def resampled(policy: DiffusionPolicy, **changes) -> DiffusionPolicy:
 def compare_sampling(policy: DiffusionPolicy, spec: TaskSpec, variants: dict[str, dict], seeds: list[int], *, lanes: int = 25,
                      limit: int | None = None) -> pd.DataFrame:
     """One row a variant of `resampled`: its name, success_once over `seeds` as successes and episodes, action_change, and
-    milliseconds a primitive step and environment that `act` takes with `lanes` environments."""
-    rows = []
+    milliseconds a primitive step and environment that `act` takes with `lanes` environments.
+
+    `difference`, `low` and `high` are its success less the first variant's, seed by seed (stats.paired): each seed is the same
+    episode for all variants, though noise to start from is drawn as each needs it.
+    """
+    rows, first = [], None
     for name, changes in variants.items():
         other = resampled(policy, **changes)
         other.reset(0)
         table = evaluate(spec, other.act, seeds, window=other.window, chunk=other.chunk, num_envs=lanes, max_episode_steps=limit)
+        first = table if first is None else first
+        pair = paired(first, table)
         windows = np.zeros((lanes, other.window, spec.obs_dim), np.float32)
         started = time.perf_counter()
         for _ in range(3):
             other.act(windows)
         milliseconds = (time.perf_counter() - started) / 3 / lanes / other.chunk * 1e3
         rows.append(dict(variant=name, successes=int(table.success_once.sum()), episodes=len(table), success=table.success_once.mean(),
-                         action_change=table.action_change.mean(), ms_per_step=milliseconds))
+                         difference=pair.difference, low=pair.low, high=pair.high, action_change=table.action_change.mean(),
+                         ms_per_step=milliseconds))
     return pd.DataFrame(rows)

@@ -25,7 +25,7 @@ SCHEDULES = ("constant", "cosine")
 
 @dataclass(frozen=True)
 class ImitateConfig:
-    """How a base policy is trained; a policy may train with other values of its own (`Policy.training`)."""
+    """How a base policy is trained; a policy may train with other values of its own (`Policy.recipe`)."""
 
     iterations: int = 1500  # gradient steps
     batch: int = 256  # windows per step
@@ -35,6 +35,7 @@ class ImitateConfig:
     beta1: float = 0.9  # AdamW's memory of gradients
     weight_decay: float = 2e-4  # on the weights that the policy names (BeT: the GPT's linear ones)
     ema_power: float = 0.0  # above 0 the averaged weights are evaluated and kept; the average remembers ever longer, 1 - (1 + step)^-power
+    hold_end: bool = False  # also imitate keeping still (TaskSpec.resting) at a demonstration's last observation; else it is left out
     pad_start: bool = True  # windows before step 0 repeat the first observation, as acting does; the paper's code skips them
     eval_every: int = 500  # gradient steps between checkpoints
     eval_episodes: int = 50  # per checkpoint, on selection seeds; 0 keeps the last
@@ -62,14 +63,16 @@ class Windows:
     """All training windows of a demonstration set: (window, obs_dim) observations, and `horizon` actions from the first of them on.
 
     Without `horizon` these are the actions taken at each position. Where a horizon reaches beyond a demonstration, `rest` says from
-    the last action what follows.
+    the last action what follows; with `hold_end` that is also what is done at the last observation, which else is left out.
     """
 
-    def __init__(self, demos: Demos, window: int, pad_start: bool, horizon: int = 0, rest: Callable[[np.ndarray], np.ndarray] = np.copy):
+    def __init__(self, demos: Demos, window: int, pad_start: bool, horizon: int = 0, rest: Callable[[np.ndarray], np.ndarray] = np.copy,
+                 hold_end: bool = False):
         observations, actions, index, offset = [], [], [], 0
         beyond = max(0, horizon - window)
         for episode in demos.episodes():
-            o, a = episode["observations"][:-1], episode["actions"]
+            o, a = episode["observations"], np.concatenate([episode["actions"], rest(episode["actions"][-1])[None]])
+            o, a = (x if hold_end else x[:-1] for x in (o, a))
             pad = window - 1 if pad_start else 0
             # Before the first step the first observation repeats; the action there is the first one's.
             o, a = (np.concatenate([np.repeat(x[:1], pad, axis=0), x]) for x in (o, a))
@@ -143,14 +146,14 @@ def imitate(kind: str, demos: Demos, config: ImitateConfig | None = None, policy
     evaluated, success_once and success_at_end on the selection seeds. A policy without gradient steps, such as VINN, is only
     given the demonstrations: it has a single row, of iteration 0, and of `config` only the evaluation and the windows matter.
     """
-    config = config or ImitateConfig(**POLICIES[kind].training)
+    config = config or ImitateConfig(**POLICIES[kind].recipe)
     spec = spec or get_task(demos.task)
     torch.manual_seed(config.seed)
     generator = torch.Generator().manual_seed(config.seed)
     policy = POLICIES[kind]({"obs_dim": spec.obs_dim, "act_dim": spec.act_dim, **POLICIES[kind].for_task(spec), **(policy_config or {})})
     policy.fit_statistics(demos.observations, demos.actions, config.seed)
     policy.to(device).train()
-    windows = Windows(demos, policy.window, config.pad_start, policy.horizon, spec.resting)
+    windows = Windows(demos, policy.window, config.pad_start, policy.horizon, spec.resting, config.hold_end)
     if not policy.learns:
         started = time.monotonic()
         policy.remember(*windows.all())

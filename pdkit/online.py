@@ -55,7 +55,7 @@ class Trainer:
         self.rng = np.random.default_rng([config.seed, 1])
         self.generator = torch.Generator().manual_seed(config.seed)
         self.agent = self._make_agent()
-        self.replay = self._make_replay(config.total_steps)
+        self.replay = self._make_replay(self.decisions)
         self.demos = None
         if demos is not None and (config.demo_fraction or self.needs_demos):
             rows = self._demo_rows(demos)
@@ -85,6 +85,12 @@ class Trainer:
     def act_dim(self) -> int:
         """Numbers in one decision: the actions of a chunk, one after the other. Residuals and critics take it as one action."""
         return self.spec.act_dim * self.base.chunk
+
+    @property
+    def decisions(self) -> int:
+        """Room for all decisions of a run. Each takes a chunk's steps but an episode's last, so that twice their quotient is enough
+        while episodes last half a chunk or longer."""
+        return min(self.config.total_steps, 2 * -(-self.config.total_steps // self.base.chunk))
 
     chunks = True  # whether base policies may decide on several actions at once
 

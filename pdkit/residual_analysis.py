@@ -27,16 +27,19 @@ from .tasks.spec import TaskSpec
 from .tasks.vector import VectorEnv
 
 PALM = slice(29, 32)  # Door's observation: position of the palm in m
-FEATURES = ("raw", "GPT")  # what VINN can look up by here; FiLM and images (Tables 12, 13) need policies that the kit does not have
+FEATURES = ("raw", "GPT", "FiLM")  # what VINN can look up by here; images (Table 13) need a policy that the kit does not have
 
 
 # ---- the first episodes ----------------------------------------------------------------------------------------------
 
 class Disturbed:
     """A base policy with the residuals of a loop that has learned nothing: uniform in [-1, 1], bounded and gated as at environment
-    step `step`. With alpha 1 and H 0 these are residual RL's first episodes."""
+    step `step`. With alpha 1 and H 0 these are residual RL's first episodes. Raises PdkitError for a base policy that acts in chunks."""
 
     def __init__(self, base: Policy, config: DecoratorConfig, step: int, seed: int = 0):
+        if base.chunk != 1:
+            raise PdkitError(f"Random residuals are added to one action at a time, and this {base.kind} policy decides on {base.chunk} at "
+                             "once: take one with chunk=1.")
         self.base, self.config, self.step, self.window, self.chunk = base, config, step, base.window, 1
         self.reset(seed)
 

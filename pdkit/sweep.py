@@ -38,11 +38,12 @@ from typing import Any
 
 from . import nb
 from .cli import Parser
-from .demos import load_demos, sources
+from .demos import sources
 from .errors import PdkitError, unknown
 from .files import ROOT, read_json, runs_root
 from .main_job import duration, expected_minutes
 from .methods.registry import base_folder, method_config
+from .policies import load_policy
 from .policies.base import read_card
 from .profiles import flat
 from .runs import NO_MATTER
@@ -165,10 +166,10 @@ def _training(spec: Spec, cell: dict[str, Any], seed: int) -> Job:
     if type(cell["episodes"]) is not int or cell["episodes"] < 1:
         raise PdkitError(f"{spec.path.name}: episodes must be a whole number of at least 1, not {cell['episodes']!r}.")
     settings = {name: value for name, value in cell.items() if name not in OPTIONS}
-    config = method_config(cell["method"], cell["task"], cell["profile"], seed, **settings)
+    base = ROOT / cell["base"] if "base" in cell else base_folder(cell["method"], cell["task"])
+    config = method_config(cell["method"], cell["task"], cell["profile"], seed, policy=load_policy(base), **settings)
     if config.demo_fraction:
-        load_demos(ROOT / cell["demos"]) if "demos" in cell else sources.bundled(cell["task"])
-    card = read_card(ROOT / cell["base"] if "base" in cell else base_folder(cell["method"], cell["task"]))
+        sources.given(cell["task"], ROOT / cell["demos"]) if "demos" in cell else sources.bundled(cell["task"])
     words = ["train", "decorated", cell["task"]]
     for name in OPTIONS[1:]:
         if name in cell:
@@ -176,7 +177,8 @@ def _training(spec: Spec, cell: dict[str, Any], seed: int) -> Job:
     words += ["--seeds", str(seed)]
     words += ["--set", *(f"{name}={_literal(value)}" for name, value in settings.items())] if settings else []
     return _job(spec, cell | {"seed": seed}, {"task": cell["task"], "recipe": cell["recipe"], "seed": seed}, words, like=cell["method"],
-                config=flat(config) | {"base": card["weights_sha256"]}, minutes=spec.minutes or expected_minutes(config, cell["episodes"]))
+                config=flat(config) | {"base": read_card(base)["weights_sha256"]},
+                minutes=spec.minutes or expected_minutes(config, cell["episodes"]))
 
 
 def _literal(value: Any) -> str:

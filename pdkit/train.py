@@ -16,7 +16,7 @@ import pandas as pd
 
 from .cli import Parser
 from .decorated import Decorated
-from .demos import Demos, load_demos, sources
+from .demos import Demos, sources
 from .errors import PdkitError, unknown
 from .evaluate import evaluate
 from .files import atomic_file, runs_root
@@ -84,10 +84,7 @@ def parse_settings(settings: list[str]) -> dict[str, Any]:
 
 def base_demos(args) -> Demos:
     """The demonstrations that the arguments name."""
-    wanted = get_task(args.task).demo_task or args.task
-    demos = load_demos(args.demos) if args.demos else sources.bundled(args.task)
-    if demos.task != wanted:
-        raise PdkitError(f"{args.demos} holds demonstrations of {demos.task}, not of {wanted}.")
+    demos = sources.given(args.task, args.demos) if args.demos else sources.bundled(args.task)
     return demos.first(args.num_demos) if args.num_demos is not None else demos
 
 
@@ -100,7 +97,7 @@ def _base(args) -> int:
     for name in settings:
         if name not in fields | set(architecture):
             raise unknown("field", name, fields | set(POLICIES[args.policy].defaults))
-    config = checked(ImitateConfig, POLICIES[args.policy].training | {k: v for k, v in settings.items() if k in fields})
+    config = checked(ImitateConfig, POLICIES[args.policy].recipe | {k: v for k, v in settings.items() if k in fields})
     out = Path(args.out) if args.out else runs_root() / "base" / f"{args.task}-{args.policy}"
     print(f"{args.policy} on {demos.num} demonstrations of {args.task} ({demos.label}): {config}", flush=True)
     policy, history = imitate(args.policy, demos, config, architecture,

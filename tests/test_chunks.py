@@ -126,6 +126,15 @@ def test_rollouts_of_chunks_are_recorded_step_by_step():
         assert np.array_equal(getattr(played[0], name), getattr(played[1], name)), name
 
 
+def test_a_replay_has_room_for_twice_the_whole_chunks_of_a_run():
+    for chunk, room in ((1, 901), (2, 901), (5, 362)):
+        base = TwoAtOnce(BIASED)
+        base.chunk = chunk
+        assert reach_trainer("residual_rl", base, total_steps=901).replay.capacity == room
+    dipo = DiffusionPolicy(dict(obs_dim=4, act_dim=2, window=2, horizon=8, chunk=4, dims=[16], groups=4, embed=16))
+    assert len(reach_trainer("dipo", dipo, total_steps=901, warmup_steps=100).agent.memory.obs) == 452
+
+
 def test_methods_for_single_actions_say_so():
     with pytest.raises(PdkitError, match="decides on 2 at once"):
         reach_trainer("jsrl", TwoAtOnce(BIASED), eval_every=1000, eval_episodes=5)

@@ -107,10 +107,25 @@ def test_reset_repeats_the_noise_and_disk_keeps_the_policy(tmp_path):
     assert np.array_equal(again.act(windows), first)
 
 
+def test_the_samplers_own_noise_comes_from_the_cpus_generator(monkeypatch):
+    """The one that a checkpoint holds; and the sampler is not asked for any elsewhere."""
+    from diffusers.schedulers import scheduling_ddpm
+
+    p, drawn, draw = policy(sampler="ddpm", diffusion_steps=5, sampler_steps=5), [], scheduling_ddpm.randn_tensor
+    monkeypatch.setattr(scheduling_ddpm, "randn_tensor", lambda *a, **k: drawn.append(k["generator"]) or draw(*a, **k))
+    p.reset(3)
+    windows = np.zeros((1, 2, 3), np.float32)
+    first = p.act(windows)
+    assert len(drawn) == 4 and all(g is torch.default_generator for g in drawn)  # the last step adds none
+    torch.set_rng_state(torch.Generator().manual_seed(3).get_state())
+    assert np.array_equal(p.act(windows), first)
+
+
 @pytest.mark.parametrize(("changes", "message"), [
     (dict(horizon=7), "multiple of 2"), (dict(chunk=8), "fit between"), (dict(chunk=0), "at least 1"),
     (dict(dims=[10, 32]), "multiples of"), (dict(sampler="euler"), "Unknown sampler"), (dict(prediction="x"), "Unknown prediction"),
-    (dict(sampler_steps=0), "from 1 to"), (dict(sampler_steps=101), "from 1 to")])
+    (dict(spacing="x"), "Unknown spacing"),
+    (dict(sampler_steps=0), "at least 1"), (dict(sampler_steps=101), "from 1 to")])
 def test_settings_that_do_not_fit_are_refused(changes, message):
     with pytest.raises(PdkitError, match=message):
         policy(**changes)
@@ -127,6 +142,41 @@ def test_windows_reach_beyond_the_end_with_actions_that_keep_still():
         assert np.array_equal(actions, episode["actions"][np.clip(np.arange(t - 1, t + 7), 0, 11)])  # targets: the last one goes on
     assert np.array_equal(cube.resting(np.array([0.3, -0.2, 0.1, -1.0], np.float32)), np.float32([0, 0, 0, -1]))  # the gripper stays shut
     assert [x.shape for x in windows.sample(5, torch.Generator())] == [(5, 2, 39), (5, 8, 28)]
+
+
+def test_keeping_still_at_the_end_is_imitated_when_asked():
+    demos = line_demos(2, 6)
+    plain, held = (Windows(demos, 2, True, 4, lambda action: np.full_like(action, 9), hold) for hold in (False, True))
+    assert len(held.index) == len(plain.index) + 2
+    for number, start in enumerate(plain.index.tolist()):  # all windows of before are there, with the same actions
+        mine = held.index.tolist()[number + number // 6]
+        assert torch.equal(plain.actions[start + plain.ahead], held.actions[mine + held.ahead])
+        assert torch.equal(plain.observations[start + plain.span], held.observations[mine + held.span])
+    for number in (6, 13):
+        start, episode = held.index.tolist()[number], demos.episode(number // 7)
+        actions = held.actions[start + held.ahead]
+        assert np.array_equal(held.observations[start + held.span], episode["observations"][-2:])
+        assert np.array_equal(actions[0], episode["actions"][-1]) and (actions[1:] == 9).all()
+    settings = dict(iterations=1, batch=8, eval_episodes=0, eval_every=1, bf16=False)
+    small = dict(horizon=4, chunk=1, dims=[16, 32], groups=4, embed=16)
+    losses = [imitate("diffusion", demos, ImitateConfig(**settings, hold_end=hold), small)[1][0]["loss"] for hold in (False, True)]
+    assert losses[0] != losses[1]
+
+
+def test_trailing_steps_begin_in_pure_noise_and_end_at_the_actions():
+    """A network that knows the actions gives them back whatever the noise; what few steps make of a constant v tells the two apart."""
+    p, clean = policy(prediction="v_prediction", spacing="trailing"), torch.arange(16.0).view(1, 8, 2) / 20
+    assert p.sampler.timesteps.tolist() == [99, 74, 49, 24] and policy().sampler.timesteps.tolist() == [75, 50, 25, 0]
+    bars = p.noise.alphas_cumprod
+
+    class Knows(torch.nn.Module):
+        def forward(self, x, k, condition):
+            bar = bars[k][:, None, None]
+            noise = (x - bar.sqrt() * clean) / (1 - bar).sqrt()
+            return bar.sqrt() * noise - (1 - bar).sqrt() * clean
+
+    p.unet = Knows()
+    assert np.allclose(p.act(np.zeros((1, 2, 3), np.float32)), clean[:, 1:4], atol=1e-4)
 
 
 def test_learning_rate_warms_up_and_falls_like_a_cosine():

@@ -65,6 +65,10 @@ def test_variants_have_the_same_weights(policy):
     expected = evaluate(PROBES["reach"], other.act, range(8), window=2, chunk=1, num_envs=4)
     assert table.successes[1] == expected.success_once.sum() and table.action_change[1] == pytest.approx(expected.action_change.mean())
     assert table.episodes.tolist() == [8, 8] and (table.ms_per_step > 0).all()
+    policy.reset(0)
+    first = evaluate(PROBES["reach"], policy.act, range(8), window=2, chunk=2, num_envs=4)
+    pair = stats.paired(first, expected)
+    assert table.difference.tolist() == [0, pair.difference] and (table.low[1], table.high[1]) == (pair.low, pair.high)
 
 
 def test_paths_end_at_success_or_the_limit(policy):

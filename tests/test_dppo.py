@@ -8,6 +8,7 @@ from test_dipo import ONE_LEVEL, SMALL, biased, policy, success  # noqa: F401 (b
 from test_ppo import moved
 from worlds import reach_trainer
 
+from pdkit import cli
 from pdkit.decorator import DecoratorConfig
 from pdkit.errors import PdkitError
 from pdkit.methods.config import MethodConfig
@@ -282,3 +283,9 @@ def test_what_dppo_cannot_use_is_refused(tmp_path):
     for bad in (dict(dppo_steps=0), dict(dppo_gamma=1.1), dict(dppo_clip=1e-4), dict(dppo_sample_std=0.0), dict(dppo_value_lr=-1.0)):
         with pytest.raises(PdkitError, match="DPPO needs"):
             MethodConfig(**bad)
+
+
+def test_a_task_without_a_diffusion_policy_is_told_what_to_give(capsys):
+    assert cli.main(["train", "decorated", "Door", "--method", "dppo"]) == 2
+    said = capsys.readouterr().err
+    assert "`pdkit train base Door --policy diffusion`" in said and "--base" in said and len(said.strip().splitlines()) == 1

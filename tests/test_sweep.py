@@ -17,7 +17,10 @@ from pdkit import cli, nb, recorded, sweep, sweep_ray, sweep_run
 from pdkit.errors import PdkitError
 from pdkit.files import DATA, ROOT, read_json, write_json
 from pdkit.main_job import expected_minutes
-from pdkit.profiles import online_config
+from pdkit.methods.registry import method_config
+from pdkit.policies import load_policy
+from pdkit.policies.base import read_card
+from pdkit.profiles import flat, online_config
 from pdkit.sweep_progress import Progress
 from pdkit.sweep_run import Job, Local, run_jobs
 
@@ -174,6 +177,22 @@ def test_a_toml_file_says_the_same_as_a_json_file(tmp_path):
     toml.write_text('name = "tiny"\nkind = "train"\nseeds = [0]\n[fixed]\ntask = "Door"\nprofile = "smoke"\nepisodes = 2\n'
                     "[grid]\nalpha = [0.1, 0.3]\n")
     assert sweep.make_jobs(sweep.load_spec(toml)) == sweep.make_jobs(sweep.load_spec(written(tmp_path)))
+
+
+def test_a_job_is_what_its_command_does(tmp_path):
+    """Over a base policy that acts in chunks, and for a task that is learned from another one's demonstrations."""
+    def config(**fixed):
+        return sweep.make_jobs(sweep.load_spec(written(tmp_path, fixed=fixed, grid={})))[0].config
+
+    base = "data/checkpoints/StackCube/diffusion"
+    chunked = config(task="StackCube", base=base)
+    assert chunked == json.loads(json.dumps(flat(method_config("policy_decorator", "StackCube", policy=load_policy(ROOT / base))))) | {
+        "base": read_card(ROOT / base)["weights_sha256"]}
+    assert chunked["gamma"] == 0.922 != config(task="StackCube")["gamma"]
+    shown = "data/demos/TurnFaucetSource.safetensors"
+    assert config(task="TurnFaucet", demos=shown)["task"] == "TurnFaucet"
+    with pytest.raises(PdkitError, match="holds demonstrations of TurnFaucetSource, not of Door"):
+        config(task="Door", demos=shown)
 
 
 def test_the_folder_follows_every_parameter_and_nothing_else(tmp_path):

@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 
 import numpy as np
 
@@ -29,6 +30,14 @@ def bundled(task: str) -> Demos:
         have = ", ".join(sorted(p.stem for p in path.parent.glob("*.safetensors"))) or "none"
         raise PdkitError(f"No demonstrations of {shown} are bundled (there are: {have}); make some with `pdkit demos`.")
     return load_demos(path)
+
+
+def given(task: str, path: str | Path) -> Demos:
+    """The demonstrations in a file, to learn this task from. Raises PdkitError when they are of another task."""
+    demos, wanted = load_demos(path), get_task(task).demo_task or task
+    if demos.task != wanted:
+        raise PdkitError(f"{path} holds demonstrations of {demos.task}, not of {wanted}.")
+    return demos
 
 
 def scripted(task: str, num: int, first_seed: int = 0, noise: float = 0.0, progress: Callable[[int, int], None] | None = None) -> Demos:

@@ -24,7 +24,7 @@ class DIPO(FineTuneDiffusion):
 
     def _make_agent(self) -> Learner:
         c, m, start = self.config, self.config.method_config, self._start_policy
-        memory = Sequences(c.total_steps, self.stored_dim, start.horizon, self.spec.act_dim, c.device)
+        memory = Sequences(self.decisions, self.stored_dim, start.horizon, self.spec.act_dim, c.device)
         return Learner(self.spec.obs_dim, self.act_dim, c.sac, c.decorator, actor=with_lora(start, m.lora), memory=memory,
                        rule=ActionGradient(m.dipo_steps, m.dipo_lr, m.dipo_norm), critic_view=self._critic_view, device=c.device)
 

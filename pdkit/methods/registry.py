@@ -6,12 +6,13 @@ from pathlib import Path
 from typing import Any
 
 from ..demos import Demos
-from ..errors import unknown
+from ..errors import PdkitError, unknown
 from ..files import DATA
 from ..online import Trainer
 from ..online_config import OnlineConfig
 from ..policies import Policy
 from ..profiles import online_config, policy_values
+from ..tasks import get_task
 from ..tasks.spec import TaskSpec
 from . import METHODS, Method
 
@@ -34,8 +35,13 @@ def method_config(method: str, task: str, profile: str = "lesson", seed: int = 0
 
 
 def base_folder(method: str, task: str) -> Path:
-    """Where the shipped policy lies that a method starts from."""
-    return DATA / "checkpoints" / task / get_method(method).base
+    """Where the shipped policy lies that a method starts from. Raises PdkitError where the kit has none for this task."""
+    m, folder = get_method(method), DATA / "checkpoints" / get_task(task).name / get_method(method).base
+    if not (folder / "policy.json").exists():
+        kind = "" if m.base == "base" else f" --policy {m.base}"
+        raise PdkitError(f"{m.title} starts from a policy that does not come with the kit for {task}: train one with "
+                         f"`pdkit train base {task}{kind}` and give its folder as the base (--base).")
+    return folder
 
 
 def make_trainer(config: OnlineConfig, base: Policy, demos: Demos | None = None, spec: TaskSpec | None = None) -> Trainer:

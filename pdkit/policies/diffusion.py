@@ -19,27 +19,31 @@ from typing import Any
 import numpy as np
 import torch
 import torch.nn.functional as F
+from torch import nn
 
 from ..errors import PdkitError, unknown
 from .base import Normalizer, Policy
 from .unet import UNet
 
 SAMPLERS = ("ddim", "ddpm")
+SPACINGS = ("leading", "trailing")
 PREDICTIONS = ("epsilon", "v_prediction")
 
 
 class DiffusionPolicy(Policy):
     """Config: obs_dim, act_dim, window (observations), horizon (actions predicted), chunk (of them executed), dims, kernel, groups and
-    embed of the U-Net, diffusion_steps of training, prediction ("epsilon", "v_prediction"), sampler ("ddim", "ddpm"), sampler_steps, and
-    late_steps (the last so many steps of sampling have a network of their own; 0: one for all)."""
+    embed of the U-Net, diffusion_steps of training, prediction ("epsilon", "v_prediction"), sampler ("ddim", "ddpm"), sampler_steps,
+    spacing (of DDIM's steps: "leading", "trailing"), and late_steps (the last so many steps of sampling have a network of their own; 0: one
+    for all)."""
 
     kind = "diffusion"
     defaults: dict[str, Any] = dict(window=2, horizon=16, chunk=4, dims=[64, 128, 256], kernel=5, groups=8, embed=64, diffusion_steps=100,
-                                    prediction="epsilon", sampler="ddim", sampler_steps=4, late_steps=0)
-    training: dict[str, Any] = dict(lr=1e-4, beta1=0.95, weight_decay=1e-6, schedule="cosine", lr_warmup=500, ema_power=0.75)
+                                    prediction="epsilon", sampler="ddim", sampler_steps=4, spacing="leading", late_steps=0)
+    least = dict(embed=4, late_steps=0)
+    recipe: dict[str, Any] = dict(lr=1e-4, beta1=0.95, weight_decay=1e-6, schedule="cosine", lr_warmup=500, ema_power=0.75)
 
     def __init__(self, config: dict[str, Any]):
-        super().__init__(self.defaults | config)
+        super().__init__(config)
         c = self.config
         self.window, self.chunk, self.horizon = c["window"], c["chunk"], c["horizon"]
         shortest = 2 ** (len(c["dims"]) - 1)
@@ -49,6 +53,9 @@ class DiffusionPolicy(Policy):
         if not 1 <= self.chunk <= self.horizon - self.window + 1:
             raise PdkitError(f"Diffusion Policy's chunk ({self.chunk}) must be at least 1 and fit between the latest of {self.window} "
                              f"observations and the horizon ({self.horizon}).")
+        if c["kernel"] % 2 != 1 or c["embed"] % 2:
+            raise PdkitError(f"Diffusion Policy's kernel must be odd, so that its U-Net keeps the time's length, and embed even, for sines "
+                             f"and cosines, not {c['kernel']} and {c['embed']}.")
         if any(d % c["groups"] for d in c["dims"]):
             raise PdkitError(f"Diffusion Policy's dims {c['dims']} must be multiples of its groups ({c['groups']}).")
         if not 1 <= c["sampler_steps"] <= c["diffusion_steps"]:
@@ -59,8 +66,8 @@ class DiffusionPolicy(Policy):
         self.sampler = _scheduler(c["sampler"], c)
         self.sampler.set_timesteps(c["sampler_steps"] if c["sampler"] == "ddim" else c["diffusion_steps"])
         if not 0 <= c["late_steps"] <= self.sampling_steps:
-            raise PdkitError(f"The steps with a network of their own must be from 0 to all {self.sampling_steps} of the sampler's, not "
-                             f"{c['late_steps']}.")
+            raise PdkitError(f"late_steps, the steps with a network of their own, must be from 0 to all {self.sampling_steps} of the "
+                             f"sampler's, not {c['late_steps']}.")
         self.late = copy.deepcopy(self.unet) if c["late_steps"] else None
 
     @property
@@ -81,6 +88,11 @@ class DiffusionPolicy(Policy):
         """What the U-Net sees of windows (N, window, obs_dim): (N, window * obs_dim)."""
         return self.normalizer(windows).flatten(1)
 
+    def film(self) -> nn.Linear:
+        """A copy of what turns an activated condition (N, window * obs_dim) into the scales and shifts of all blocks of the U-Net, as far
+        as they depend on the observations: what the diffusion step adds is the same for all."""
+        return self.unet.film(self.config["obs_dim"] * self.window)
+
     def loss(self, windows: torch.Tensor, actions: torch.Tensor) -> dict[str, torch.Tensor]:
         noise = torch.randn(actions.shape).to(actions.device)  # drawn on the CPU everywhere: one generator to restore
         steps = torch.randint(self.config["diffusion_steps"], (len(actions),)).to(actions.device)
@@ -92,7 +104,9 @@ class DiffusionPolicy(Policy):
         """All actions (N, horizon, act_dim) that pure noise of that shape becomes."""
         actions, condition = noise, self.condition(windows)
         for number, step in enumerate(self.sampler.timesteps):
-            actions = self.sampler.step(self.predicted(number, actions, condition), step, actions).prev_sample
+            # DDPM's fresh noise, too, comes from torch's generator on the CPU, on whichever device: checkpoints hold that one alone.
+            actions = self.sampler.step(self.predicted(number, actions, condition), step, actions,
+                                        generator=torch.default_generator).prev_sample
         return actions
 
     def predicted(self, number: int, actions: torch.Tensor, condition: torch.Tensor) -> torch.Tensor:
@@ -113,11 +127,13 @@ def _scheduler(name: str, config: dict[str, Any]):
     from diffusers.schedulers.scheduling_ddim import DDIMScheduler
     from diffusers.schedulers.scheduling_ddpm import DDPMScheduler
 
-    for field, value, known in (("sampler", name, SAMPLERS), ("prediction", config["prediction"], PREDICTIONS)):
+    for field, value, known in (("sampler", name, SAMPLERS), ("prediction", config["prediction"], PREDICTIONS),
+                                ("spacing", config["spacing"], SPACINGS)):
         if value not in known:
             raise unknown(field, value, known)
     settings = dict(num_train_timesteps=config["diffusion_steps"], beta_schedule="squaredcos_cap_v2", clip_sample=True,
                     prediction_type=config["prediction"])
-    # DDIM's few steps begin a step's width below the last (4 of 100: 75, 50, 25, 0), not at the last itself: there next to nothing is
-    # left of the actions, and what they were, told from the predicted noise, would be a coin toss for each number.
-    return DDIMScheduler(**settings, timestep_spacing="leading") if name == "ddim" else DDPMScheduler(**settings)
+    # "leading" steps begin a step's width below the last (4 of 100: 75, 50, 25, 0), not at the last itself: there next to nothing is left
+    # of the actions, and what they were, told from the predicted noise, would be a coin toss for each number. A network that gives v tells
+    # the actions there, too: "trailing" steps (99, 74, 49, 24; Lin et al., 2023) then spare it noise that it would take for actions.
+    return DDIMScheduler(**settings, timestep_spacing=config["spacing"]) if name == "ddim" else DDPMScheduler(**settings)

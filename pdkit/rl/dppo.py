@@ -16,7 +16,9 @@ noise schedule at step k and abar' at the next step taken (k - 1, or further wit
     c_k      first + (last - first) * (exp(rate * t) - 1) / (exp(rate) - 1),   t from 0 at the noisiest step to 1 at the last
     value    1/2 mean (V(s) - R)^2,   of the environment's state alone: one value for all steps of a decision
 
-Evaluation samples as the imitated policy does: by DDIM without noise.
+What learns is not quite what is evaluated: while it learns, a chain is sampled with eta = 1, and with noise of at least `least` in every
+step, also in those before the fine-tuned ones; evaluated and saved is the policy with the sampler of its imitation, for DDIM eta = 0:
+no noise in any step.
 """
 from __future__ import annotations
 
