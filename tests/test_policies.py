@@ -148,7 +148,7 @@ BAD = [  # policy, setting as typed, what the sentence must name
     ("diffusion", "diffusion_steps=0", "at least 1"), ("diffusion", "sampler_steps=4.0", "a whole number"),
     ("diffusion", "sampler=3", "a word"), ("diffusion", "prediction=x", "Unknown prediction"), ("diffusion", "late_steps=9", "from 0 to"),
     ("mlp", "hidden=0", "at least 1"), ("mlp", "hidden=x", "a whole number"), ("mlp", "layers=-1", "at least 0"),
-    ("mlp", "window=2", "one observation"),
+    ("mlp", "window=2", "one observation"), ("mlp", "std_floor=-1", "at least 0"),
     ("rnn", "window=0", "at least 1"), ("rnn", "layers=0", "at least 1"), ("rnn", "hidden=1.5", "a whole number"),
     ("cnn", "window=0", "at least 1"), ("cnn", "layers=0", "at least 1"), ("cnn", "kernel=2", "odd"), ("cnn", "hidden=-1", "at least 1"),
     ("vinn", "k=0", "at least 1"), ("vinn", "k=x", "a whole number"), ("vinn", "exclusion=-1", "at least 0"),
