@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from scipy import stats as scipy_stats
 
-from . import base_analysis, stats
+from . import base_analysis, pixel_analysis, stats
 from .errors import PdkitError
 from .policies import bet
 
@@ -117,6 +117,28 @@ def best_of(answer: Callable, strict: bool = False) -> bool:
                        f"for p={p:g}, n={n} and m={m} it gives {got:.3f}, not {expected:.3f}.")
 
     return _judge("best_of", complaints, strict)
+
+
+def shift(answer: Callable, strict: bool = False) -> bool:
+    """15: a picture (H, W, C) moved down and right by whole pixels, the bared edge repeating the nearest pixels."""
+    def complaints() -> Iterator[str]:
+        picture = np.random.default_rng(0).integers(0, 255, (6, 5, 3), np.uint8)
+        for down, right in ((0, 0), (2, 0), (0, 1), (-1, -2), (2, -1)):
+            got, expected = np.asarray(answer(picture.copy(), down, right)), pixel_analysis.shifted(picture, down, right)
+            if got.shape != expected.shape:
+                yield f"moving {picture.shape} by ({down}, {right}) gives {got.shape}: the size must stay."
+            elif np.array_equal(got, expected):
+                continue
+            elif np.array_equal(got, np.roll(picture, (down, right), (0, 1))):
+                yield "what leaves on one side comes back on the other (np.roll): the bared edge must repeat the nearest pixels."
+            elif np.array_equal(got, pixel_analysis.shifted(picture, -down, -right)):
+                yield "it moves the other way: row r of the result is row r - down of the picture."
+            elif np.array_equal(got, pixel_analysis.shifted(picture, right, down)):
+                yield "down and right are exchanged: rows are the first axis."
+            else:
+                yield f"moving by ({down}, {right}) is wrong in {(got != expected).mean():.0%} of the numbers."
+
+    return _judge("shift", complaints, strict)
 
 
 def gate(answer: Callable, strict: bool = False) -> bool:

@@ -22,6 +22,8 @@ from .errors import PdkitError
 from .methods import METHODS
 from .methods.ppo import OnPolicy
 from .methods.registry import base_folder, get_method, method_config, trainer_of
+from .pixels.pictures import encoded, pictures_of
+from .pixels.task import encoder_of
 from .plots_compare import labelled, over_seeds
 from .policies import load_policy
 from .policies.base import read_card
@@ -203,7 +205,9 @@ def own_run(method: str, task: str, profile: str, seed: int, folder: Path, episo
     mark = hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:8]
     run = Run(folder / f"{method}-seed{seed}-{mark}", "decorated", settings)
     if not run.finished or run.manifest["results"]["episodes"] != episodes:
-        decorate(config, policy, demos, run.folder, episodes, origin(card, demos))
+        encoder = encoder_of(start)
+        seen = encoded(demos, pictures_of(demos), encoder) if encoder and demos else demos
+        decorate(config, policy, seen, run.folder, episodes, origin(card, demos), encoder=encoder)
         run = Run(run.folder, "decorated", settings)
     labels = {"task": task, "recipe": recipe or method, "seed": seed}
     return pd.DataFrame([run.manifest["results"] | labels]), pd.read_csv(run.folder / "metrics.csv").assign(**labels)

@@ -157,7 +157,7 @@ def imitate(kind: str, demos: Demos, config: ImitateConfig | None = None, policy
     if not policy.learns:
         started = time.monotonic()
         policy.remember(*windows.all())
-        row = {"iteration": 0, "seconds": time.monotonic() - started} | _scores(spec, policy, config)
+        row = {"iteration": 0, "seconds": time.monotonic() - started} | selection_scores(spec, policy, config)
         if progress:
             progress(row)
         return policy.eval(), [row]
@@ -178,7 +178,7 @@ def imitate(kind: str, demos: Demos, config: ImitateConfig | None = None, policy
         score = float(iteration)  # without evaluations the latest wins
         with average.in_place() if average else contextlib.nullcontext():
             if config.eval_episodes:
-                row |= _scores(spec, policy.eval(), config)
+                row |= selection_scores(spec, policy.eval(), config)
                 score = row["success_once"]
                 policy.train()
             if score > best:
@@ -190,7 +190,7 @@ def imitate(kind: str, demos: Demos, config: ImitateConfig | None = None, policy
     return policy.eval(), history
 
 
-def _scores(spec: TaskSpec, policy: Policy, config: ImitateConfig) -> dict[str, float]:
+def selection_scores(spec: TaskSpec, policy: Policy, config: ImitateConfig) -> dict[str, float]:
     """Success on the selection seeds; nothing without episodes."""
     if not config.eval_episodes:
         return {}

@@ -136,12 +136,11 @@ def outcomes_figure(panels: Mapping[str, pd.DataFrame], labels: Mapping[str, str
             for shift, rate, shade in ((-0.14, row.before, COLORS["base"]), (0.14, row.after, color)):
                 ax.plot([rate.low, rate.high], [y + shift] * 2, color=shade, lw=2.4)
                 ax.plot(rate.value, y + shift, "o", color=shade, ms=6)
-        ax.set(xlim=(-0.03, 1.03), xlabel="success (grey: where it starts)")
+        ax.set(xlim=(-0.03, 1.03), ylim=(most - 0.5, -0.5), xlabel="success (grey: where it starts)")
         ax.xaxis.set_major_formatter(mpl.ticker.PercentFormatter(1.0, decimals=0))
         ax.set_title(name)
         ax.grid(axis="y", visible=False)
     first = next(iter(panels.values()))
     axes[0, 0].set_yticks(range(len(first)), [f"{labels[r.recipe]}, seed {r.seed}" for r in first.itertuples()])
-    axes[0, 0].invert_yaxis()
     figure.suptitle(title, x=0.01, ha="left", weight="bold", fontsize=12)
     return figure

@@ -19,13 +19,17 @@ from .decorated import Decorated
 from .demos import Demos, sources
 from .errors import PdkitError, unknown
 from .evaluate import evaluate
-from .files import atomic_file, runs_root
+from .files import DATA, atomic_file, runs_root
 from .imitate import ImitateConfig, imitate
 from .methods import METHODS
 from .methods.registry import base_folder as shipped_base
 from .methods.registry import make_trainer, method_config, trainer_of
 from .online import Trainer
 from .online_config import OnlineConfig
+from .pixels.encoders import Encoder, save_encoder
+from .pixels.learn import imitate_pixels
+from .pixels.pictures import encoded, pictures_of
+from .pixels.task import ENCODER, encoder_of, pixel_spec, save_visual
 from .policies import POLICIES, Policy, load_policy, save_policy
 from .policies.base import read_card
 from .profiles import PROFILES, checked, differences, flat
@@ -47,6 +51,7 @@ def main(argv: list[str]) -> int:
     base.add_argument("--demos", help="demonstration file (default: the bundled one)")
     base.add_argument("--num-demos", type=int, help="use only the first so many")
     base.add_argument("--out", help="folder of the checkpoint (default runs/base/TASK-POLICY)")
+    base.add_argument("--pixels", action="store_true", help="see pictures instead of the object's state: train an encoder with the policy")
     decorated = kinds.add_parser("decorated", help="improve a base policy by online RL on sparse reward, by any of the methods")
     decorated.add_argument("task")
     decorated.add_argument("--profile", default="lesson", help=f"one of: {', '.join(PROFILES)}")
@@ -59,6 +64,7 @@ def main(argv: list[str]) -> int:
     decorated.add_argument("--out", help="folder of the runs (default runs/train)")
     decorated.add_argument("--record", help="name under data/results: rows are added to NAME.csv and NAME_curves.csv")
     decorated.add_argument("--recipe", help="what to call this configuration in the record (default: lesson, or the method)")
+    decorated.add_argument("--pixels", action="store_true", help="start from the shipped visual policy (--base may name another)")
     decorated.add_argument("--tensorboard", action="store_true", help="also write event files to the folder of each run")
     for one in (base, decorated):
         one.add_argument("--threads", type=int, default=1)
@@ -92,20 +98,30 @@ def _base(args) -> int:
     if args.policy not in POLICIES:
         raise unknown("policy", args.policy, POLICIES)
     demos, settings = base_demos(args), parse_settings(args.set)
+    shift = settings.pop("random_shift", None) if args.pixels else None
     fields = {f.name for f in dataclasses.fields(ImitateConfig)}
     architecture = {k: v for k, v in settings.items() if k in POLICIES[args.policy].defaults}
     for name in settings:
         if name not in fields | set(architecture):
             raise unknown("field", name, fields | set(POLICIES[args.policy].defaults))
     config = checked(ImitateConfig, POLICIES[args.policy].recipe | {k: v for k, v in settings.items() if k in fields})
-    out = Path(args.out) if args.out else runs_root() / "base" / f"{args.task}-{args.policy}"
+    out = Path(args.out) if args.out else runs_root() / "base" / f"{args.task}-{args.policy}{'-pixels' if args.pixels else ''}"
     print(f"{args.policy} on {demos.num} demonstrations of {args.task} ({demos.label}): {config}", flush=True)
-    policy, history = imitate(args.policy, demos, config, architecture,
-                              progress=lambda row: print("  " + ", ".join(f"{k} {v:.3g}" for k, v in row.items()), flush=True))
+
+    def show(row: dict[str, float]) -> None:
+        print("  " + ", ".join(f"{k} {v:.3g}" for k, v in row.items()), flush=True)
+
+    if args.pixels:
+        policy, encoder, history = imitate_pixels(args.policy, demos, pictures_of(demos), config, architecture, shift=shift, progress=show)
+    else:
+        policy, history = imitate(args.policy, demos, config, architecture, progress=show)
     best = max(history, key=lambda row: row.get("success_once", row["iteration"]))
-    save_policy(policy, out, {"task": args.task, "demos": demos.num, "demos_checksum": demos.checksum, "label": demos.label,
-                              "imitate": asdict(config), "selected": best, "command": "pdkit train " + " ".join(sys.argv[2:]),
-                              "machine": describe_machine()})
+    info = {"task": args.task, "demos": demos.num, "demos_checksum": demos.checksum, "label": demos.label, "imitate": asdict(config),
+            "selected": best, "command": "pdkit train " + " ".join(sys.argv[2:]), "machine": describe_machine()}
+    if args.pixels:
+        save_visual(policy, encoder, out, info)
+    else:
+        save_policy(policy, out, info)
     print(f"wrote {out}")
     return 0
 
@@ -113,7 +129,12 @@ def _base(args) -> int:
 def _decorated(args) -> int:
     settings = parse_settings(args.set)
     get_task(args.task)
-    base_folder = Path(args.base) if args.base else shipped_base(args.method, args.task)
+    visual = DATA / "checkpoints" / args.task / "pixels" / "base"
+    base_folder = Path(args.base) if args.base else visual if args.pixels else shipped_base(args.method, args.task)
+    encoder = encoder_of(base_folder)
+    if args.pixels and not encoder:
+        raise PdkitError(f"There is no visual policy in {base_folder}; train one with `pdkit train base {args.task} --policy mlp --pixels` "
+                         "and name its folder with --base.")
     args.recipe = args.recipe or ("lesson" if args.method == "policy_decorator" else args.method)
     if args.episodes < 1 or min(args.seeds) < 0:
         raise PdkitError("--episodes must be at least 1 and every seed 0 or more.")
@@ -126,7 +147,9 @@ def _decorated(args) -> int:
         out = Path(args.out or runs_root() / "train") / f"{args.task}-{args.recipe}-seed{seed}"
         demos = base_demos(args) if config.demo_fraction or trainer_of(args.method).needs_demos else None
         started_from = origin(read_card(base_folder), demos)
-        row = decorate(config, base, demos, out, args.episodes, started_from, args.tensorboard)
+        if encoder and demos:
+            demos = encoded(demos, pictures_of(demos), encoder)
+        row = decorate(config, base, demos, out, args.episodes, started_from, args.tensorboard, encoder)
         row |= {"recipe": args.recipe, "command": command_of(args, seed)}
         print(", ".join(f"{k} {v}" for k, v in row.items()), flush=True)
         if args.record:
@@ -145,6 +168,7 @@ def command_of(args, seed: int) -> str:
     parts = ["pdkit train decorated", args.task, *method, f"--profile {args.profile}", f"--seeds {seed}", f"--recipe {args.recipe}",
              f"--episodes {args.episodes}", f"--threads {args.threads}"]
     parts += [f"--base {args.base}"] if args.base else []
+    parts += ["--pixels"] if args.pixels else []
     parts += [f"--demos {args.demos}"] if args.demos else []
     parts += [f"--num-demos {args.num_demos}"] if args.num_demos else []
     parts += ["--set " + " ".join(args.set)] if args.set else []
@@ -152,13 +176,14 @@ def command_of(args, seed: int) -> str:
 
 
 def decorate(config, base: Policy, demos: Demos | None, out: Path, episodes: int, started_from: dict[str, Any],
-             tensorboard: bool = False) -> dict[str, Any]:
+             tensorboard: bool = False, encoder: Encoder | None = None) -> dict[str, Any]:
     """Train (or resume) one seed in `out`, evaluate base and decorated on the same test seeds, and return one row of evidence.
 
     `started_from` (see `origin`) tells which base policy and demonstrations these are; a run is resumed only with the same ones.
+    With an `encoder` the task is seen through it, and so are the demonstrations.
     """
     run = Run(out, "decorated", flat(config) | started_from)
-    trainer = make_trainer(config, base, demos)
+    trainer = make_trainer(config, base, demos, pixel_spec(get_task(config.task), encoder) if encoder else None)
     board, shown = Board(out) if tensorboard else None, set()
 
     def show(t: Trainer) -> None:
@@ -175,6 +200,8 @@ def decorate(config, base: Policy, demos: Demos | None, out: Path, episodes: int
         board.close()
     run.write_metrics(trainer.rows)
     trainer.save_policy(policy, out / "decorated")
+    if encoder:
+        save_encoder(encoder, out / "decorated" / "base" / ENCODER)
     tables = {"base": _base_episodes(base, trainer.spec, episodes, config, started_from["base"]),
               "decorated": _episodes(policy, trainer.spec, episodes)}
     for name, table in tables.items():

@@ -11,6 +11,8 @@ from .cli import Parser
 from .decorated import Decorated, load_decorated
 from .errors import PdkitError
 from .evaluate import evaluate
+from .pixels.encoders import Encoder
+from .pixels.task import encoder_of, pixel_spec
 from .policies import Policy, load_policy
 from .recorded import record
 from .seeds import reported_seeds
@@ -27,13 +29,15 @@ def load_any(folder: str | Path) -> tuple[str, Policy | Decorated]:
     return "base", load_policy(folder)
 
 
-def transfer(policy: Policy | Decorated, tasks: Sequence[str], episodes: int, **options: Any) -> pd.DataFrame:
-    """Success on the first `episodes` test seeds of each task, one row a task; `options` go to `evaluate`.
+def transfer(policy: Policy | Decorated, tasks: Sequence[str], episodes: int, encoder: Encoder | None = None,
+             **options: Any) -> pd.DataFrame:
+    """Success on the first `episodes` test seeds of each task, one row a task; `options` go to `evaluate`, `encoder` is what the policy
+    sees the tasks through.
 
     Columns: task, episodes, success with Wilson's 95 % interval (low, high), success_at_end. Raises PdkitError for an unknown task,
     or one whose observations or actions are not the policy's.
     """
-    specs = [get_task(task) for task in tasks]
+    specs = [pixel_spec(get_task(task), encoder) if encoder else get_task(task) for task in tasks]
     config = (policy.base if isinstance(policy, Decorated) else policy).config
     for spec in specs:
         if (config["obs_dim"], config["act_dim"]) != (spec.obs_dim, spec.act_dim):
@@ -61,7 +65,7 @@ def main(argv: list[str]) -> int:
         raise PdkitError(f"--episodes must be at least 1, not {args.episodes}.")
     set_threads(args.threads)
     kind, policy = load_any(args.policy)
-    rows = transfer(policy, args.tasks, args.episodes)
+    rows = transfer(policy, args.tasks, args.episodes, encoder_of(args.policy))
     for row in rows.itertuples():
         print(f"{row.task}: {wilson(round(row.success * row.episodes), row.episodes)}; at the last step {row.success_at_end:.1%}")
     if args.record:

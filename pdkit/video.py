@@ -24,6 +24,7 @@ from .errors import PdkitError
 from .evaluate import Actor, ask
 from .files import atomic_file
 from .machine import MUJOCO_DRAWS
+from .pixels.cameras import CAMERAS
 from .plots import COLORS, Picture, blank, styled
 from .policies import Policy
 from .tasks.spec import TaskSpec
@@ -31,14 +32,6 @@ from .tasks.spec import TaskSpec
 SWITCH = "PDKIT_RENDER"  # environment variable: "off" turns all pictures off
 EMBED_BYTES = 500_000  # largest video put into a page or a notebook
 FPS = 30
-
-# Cameras from which hand and object are seen throughout; the environments' own stand far away.
-CAMERAS = {
-    "Door": {"distance": 1.25, "azimuth": 55.0, "elevation": -35.0, "lookat": np.array([0.08, -0.12, 0.27])},
-    "Pen": {"distance": 0.7, "azimuth": 45.0, "elevation": -40.0, "lookat": np.array([0.0, -0.15, 0.25])},
-    "Hammer": {"distance": 0.9, "azimuth": 45.0, "elevation": -30.0, "lookat": np.array([0.0, -0.1, 0.2])},
-    "Relocate": {"distance": 1.1, "azimuth": 60.0, "elevation": -30.0, "lookat": np.array([0.0, -0.1, 0.25])},
-}
 
 
 @dataclass(frozen=True)

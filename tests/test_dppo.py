@@ -46,10 +46,10 @@ def rollout(learner, rows=16):
 # ---- terms -----------------------------------------------------------------------------------------------------------
 
 @pytest.mark.parametrize("prediction", ["epsilon", "v_prediction"])
-@pytest.mark.parametrize("sampler", ["ddim", "ddpm"])
-def test_a_step_is_that_of_diffusers(sampler, prediction):
+@pytest.mark.parametrize(("sampler", "spacing"), [("ddim", "leading"), ("ddim", "trailing"), ("ddpm", "leading")])
+def test_a_step_is_that_of_diffusers(sampler, spacing, prediction):
     """DDIM with eta = 1 and four steps, and DDPM with a hundred; predictions so large that x0 is clipped too."""
-    scheduler = _scheduler(sampler, dict(diffusion_steps=100, prediction=prediction))
+    scheduler = _scheduler(sampler, dict(diffusion_steps=100, prediction=prediction, spacing=spacing))
     scheduler.set_timesteps(4 if sampler == "ddim" else 100)
     steps, noise = Steps(scheduler), torch.randn(5, 4, 2)
     for number in range(0, len(steps.times), 1 if sampler == "ddim" else 33):

@@ -176,6 +176,14 @@ def test_ablations(tmp_path):
     assert (tmp_path / "grid_curves.png").exists() and result["exercise_solved"] is False
 
 
+def test_pixels_where_nothing_can_be_drawn(tmp_path):
+    """What is recorded, and who is lost when blindfolded, needs no renderer (tests/test_pixels.py draws)."""
+    result = run("15", tmp_path)
+    assert result["drawn"] == [] and result["env_steps"] == 0 and result["recorded_runs"] >= 1
+    assert result["times_more_memory"]["Door"] == pytest.approx(43.5, abs=0.1) and set(result["blindfolded"]) == {"base", "decorated"}
+    assert result["verdict"] in ("partly", "not") and (tmp_path / "memory.png").exists() and result["exercise_solved"] is False
+
+
 def test_leaderboard(tmp_path):
     result = run("16", tmp_path, method="ppo_residual_rl", changes='{"ppo_epochs": 2}')
     assert result["method"] == "ppo_residual_rl,ppo_epochs=2" and result["updates"] == 32  # 4 rollouts of 32 x 4, 2 x 4 updates each

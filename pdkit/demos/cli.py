@@ -30,7 +30,11 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--out", help="file to write (default runs/demos/TASK-SOURCE-NUM.safetensors)")
     parser.add_argument("--show", metavar="FILE", help="check and describe a file instead")
     parser.add_argument("--list", action="store_true", help="describe the bundled files")
+    parser.add_argument("--pixels", action="store_true", help="draw what a visual policy's cameras see along the demonstrations in --show, "
+                                                              "or the task's bundled ones, and keep the pictures under runs/")
     args = parser.parse_args(argv)
+    if args.pixels:
+        return _draw(args)
     if args.show or args.list:
         for path in [Path(args.show)] if args.show else sorted((DATA / "demos").glob("*.safetensors")):
             describe(load_demos(path), path)
@@ -49,6 +53,20 @@ def main(argv: list[str]) -> int:
     demos = _make(args, source)
     save_demos(demos, out)
     describe(demos, out)
+    return 0
+
+
+def _draw(args) -> int:
+    """Pictures along demonstrations, as a policy trained with --pixels sees them."""
+    from ..pixels.pictures import picture_file, pictures_of
+
+    if not (args.show or args.task):
+        raise PdkitError("Name a task whose demonstrations are to be drawn, or a file of them with --show.")
+    demos = load_demos(Path(args.show)) if args.show else sources.bundled(args.task)
+    pictures = pictures_of(demos, Progress(demos.num))
+    cameras, height, width = len(pictures.rgb[0]) // 3, *pictures.rgb.shape[2:]
+    print(f"{picture_file(demos)}: {len(pictures.rgb)} frames of {cameras} camera(s), {height} x {width}"
+          f"{', with distances' if pictures.depth.size else ''}; {demos.num} demonstrations replayed as recorded")
     return 0
 
 

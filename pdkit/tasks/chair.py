@@ -20,30 +20,35 @@ from .chair_assets import Chair, chairs
 from .chair_body import HZ, chair_start, solved
 from .chair_plan import plan
 from .maniskill import renew_physics
-from .maniskill_headless import make_env, quiet
+from .maniskill_headless import Camera, make_env, quiet
 from .mobile_panda import CONTROL, MobilePanda
 from .spec import TaskSpec
 
+CAMERA: Camera = ((2.0, -2.0, 2.2), (0.0, 0.0, 0.5))  # ManiSkill's own; visual policies bring theirs
 
-def make_chair_env(selection: list[Chair]) -> Any:
-    """The stock ManiSkill environment in which every episode has one of the chairs."""
+
+def make_chair_env(selection: list[Chair], cameras: bool = False) -> Any:
+    """The stock ManiSkill environment in which every episode has one of the chairs; with `cameras` in a scene that can be drawn."""
     with quiet():
         from . import chair_env  # registers it
-    return make_env(chair_env.NAME, CONTROL, chairs=selection)
+    return make_env(chair_env.NAME, CONTROL, CAMERA if cameras else None, chairs=selection)
 
 
 class PushChair:
-    """The fast step; see `Sim` for the methods. `kind` is "source" or "novel"; a chair's scene is built when first needed."""
+    """The fast step; see `Sim` for the methods. `kind` is "source" or "novel"; a chair's scene is built when first needed.
 
-    def __init__(self, kind: str, render: bool = False):
-        self._can_render = render
+    With `cameras` the scenes can be drawn by pdkit/pixels (`render` draws plans of the floor, without a scene).
+    """
+
+    def __init__(self, kind: str, render: bool = False, cameras: bool = False):
+        self._can_render, self._cameras = render, cameras
         self._chairs = chairs(kind)
         self._scenes: dict[int, tuple[Any, MobilePanda]] = {}
 
     def reset(self, seed: int) -> np.ndarray:
         start = chair_start(seed, len(self._chairs))
         if start.chair not in self._scenes:
-            env = make_chair_env([self._chairs[start.chair]])
+            env = make_chair_env([self._chairs[start.chair]], self._cameras)
             self._scenes[start.chair] = env, MobilePanda(env)
         self._env, self._panda = self._scenes[start.chair]
         self._chair = self._env.body

@@ -6,7 +6,10 @@ the same scene without torch. Importing this module imports ManiSkill.
 """
 from __future__ import annotations
 
-from collections.abc import Sequence
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, nullcontext
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,7 +28,7 @@ from mani_skill.utils.structs.types import DefaultMaterialsConfig, SceneConfig, 
 from ..errors import PdkitError
 from .chair_assets import SCALE, Chair
 from .chair_body import CLOSE, HZ, STILL, UPRIGHT, ChairBody, chair_start
-from .maniskill_headless import without_materials
+from .maniskill import building
 from .mobile_panda import ACTING, ARM_REST, BASE_JOINTS, CONTROL, FINGERS, JOINTS, SIDES, TIPS, arm_joints, finger_joints, joint_order
 from .partnet import link_parts
 
@@ -59,6 +62,20 @@ class MobilePandaDualArm(BaseAgent):
         return {CONTROL: parts}
 
 
+@contextmanager
+def _drawn_description() -> Iterator[None]:
+    """Within this block the robot is described with meshes that can be drawn: the wheel's URDF names .dae files, and has .glb ones."""
+    folder, original = Path(MobilePandaDualArm.urdf_path).parent, MobilePandaDualArm.urdf_path
+    text = Path(original).read_text().replace(".dae", ".glb").replace('filename="', f'filename="{folder}/')
+    with tempfile.TemporaryDirectory() as temporary:
+        MobilePandaDualArm.urdf_path = f"{temporary}/drawn.urdf"
+        Path(MobilePandaDualArm.urdf_path).write_text(text)
+        try:
+            yield
+        finally:
+            MobilePandaDualArm.urdf_path = original
+
+
 @register_env(NAME, max_episode_steps=200)
 class PushChairEnv(BaseEnv):
     """Push the chair to the origin. A reset builds the scene anew, with the chair that the seed picks out of `chairs`."""
@@ -67,7 +84,7 @@ class PushChairEnv(BaseEnv):
     SUPPORTED_REWARD_MODES = ("sparse", "none")
 
     def __init__(self, *args: Any, chairs: Sequence[Chair], **kwargs: Any):
-        self._chairs = chairs
+        self._chairs, self._drawn = chairs, kwargs.get("render_backend") != "none"
         super().__init__(*args, robot_uids=MobilePandaDualArm.uid, reconfiguration_freq=1, **kwargs)
 
     @property
@@ -77,11 +94,12 @@ class PushChairEnv(BaseEnv):
             default_materials_config=DefaultMaterialsConfig(static_friction=0.5, dynamic_friction=0.5, restitution=0))
 
     def _reconfigure(self, options: dict) -> None:
-        with without_materials():
+        with building(self._drawn):
             super()._reconfigure(options)
 
     def _load_agent(self, options: dict) -> None:
-        super()._load_agent(options, sapien.Pose())
+        with _drawn_description() if self._drawn else nullcontext():
+            super()._load_agent(options, sapien.Pose())
         self.agent.robot.links_map["adjustable_body"].set_collision_group_bit(2, TORSO, 1)
         self._order = joint_order(self.agent.robot)
 

@@ -1,0 +1,122 @@
+"""Imitation from pictures: an encoder and a policy behind it, trained together (facts.md 2.2: end to end, random shift).
+
+The policy is one of the ordinary kinds; what it sees at each step is the robot's state and the encoder's features. Afterwards its
+normaliser is fitted to the features as well, and its first layer changed so that it computes what it did: the learner of online RL
+sees observations through that normaliser.
+"""
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from torch import nn
+
+from ..demos.format import Demos
+from ..errors import PdkitError
+from ..imitate import ImitateConfig, Windows, selection_scores
+from ..policies import MLP, POLICIES, BeT, Policy
+from ..tasks import get_task
+from ..tasks.spec import TaskSpec
+from ..torch_setup import autocast
+from .cameras import View, view_of
+from .encoders import FEATURES, Encoder, random_shift
+from .pictures import Pictures, encoded
+from .task import pixel_spec
+
+HEADS = ("mlp", "bet")
+
+
+def imitate_pixels(kind: str, demos: Demos, pictures: Pictures, config: ImitateConfig, policy_config: dict | None = None, *,
+                   shift: int | None = None, progress: Callable[[dict], None] | None = None, spec: TaskSpec | None = None,
+                   view: View | None = None) -> tuple[Policy, Encoder, list[dict]]:
+    """Train an encoder and a policy of `kind` on demonstrations and their pictures.
+
+    `shift` is the random shift in pixels (the view's, if not given); `spec` and `view` are for worlds outside the registry.
+    Returns the selected policy and encoder, in evaluation mode and with weights rounded to bfloat16 (as they are shipped), and one row
+    a checkpoint as `imitate` does. Raises PdkitError for a kind of policy that is not one of HEADS, or a loss that is no number.
+    """
+    if kind not in HEADS:
+        raise PdkitError(f"Policies that see pictures are of the kinds {' and '.join(HEADS)}, not {kind}.")
+    view, spec = view or view_of(demos.task), spec or get_task(demos.task)
+    shift = view.shift if shift is None else shift
+    torch.manual_seed(config.seed)
+    generator = torch.Generator().manual_seed(config.seed)
+    policy = POLICIES[kind]({"obs_dim": view.state_dim + FEATURES, "act_dim": spec.act_dim, **(policy_config or {})})
+    encoder = Encoder(view)
+    state = view.robot(demos.observations)
+    unscaled = np.zeros((len(state), FEATURES), np.float32)  # a number that never varies is passed through by the normaliser
+    policy.fit_statistics(np.concatenate([state, unscaled], axis=1), demos.actions, config.seed)
+    policy.train()
+    # A window of observations is told by the number of each frame, and the robot's state then.
+    numbered = np.concatenate([np.arange(len(state), dtype=np.float32)[:, None], state], axis=1)
+    windows = Windows(dataclasses.replace(demos, observations=numbered), policy.window, config.pad_start, policy.horizon, spec.resting)
+    rgb, depth = torch.from_numpy(pictures.rgb), torch.from_numpy(pictures.depth.astype(np.int32))
+    groups = [*policy.parameter_groups(config.weight_decay), {"params": list(encoder.parameters()), "weight_decay": config.weight_decay}]
+    optimizer = torch.optim.AdamW(groups, lr=config.lr, betas=(config.beta1, 0.999), fused=True)
+    rates = torch.optim.lr_scheduler.LambdaLR(optimizer, config.lr_factor)
+    history, best, chosen, started = [], -1.0, None, time.monotonic()
+    for iteration in range(1, config.iterations + 1):
+        observations, actions = windows.sample(config.batch, generator)
+        frames = observations[..., 0].long().flatten()
+        with autocast("cpu", config.bf16):
+            seen = torch.cat([rgb[frames].int(), depth[frames]], dim=1)
+            if shift:
+                seen = random_shift(seen, shift, generator)
+            features = encoder(*seen.split([rgb.shape[1], depth.shape[1]], dim=1)).unflatten(0, observations.shape[:2])
+            terms = policy.loss(torch.cat([observations[..., 1:], features.float()], dim=-1), actions)
+        optimizer.zero_grad(set_to_none=True)
+        terms["loss"].backward()
+        optimizer.step()
+        rates.step()
+        if iteration % config.eval_every and iteration < config.iterations:
+            continue
+        row = {"iteration": iteration, "seconds": time.monotonic() - started, **{k: float(v.detach()) for k, v in terms.items()}}
+        if not np.isfinite(row["loss"]):
+            raise PdkitError(f"The imitation loss became {row['loss']} at iteration {iteration}; lower lr (now {config.lr}).")
+        candidate = _finished(policy, encoder, demos, pictures)
+        row |= selection_scores(pixel_spec(spec, candidate[1]), candidate[0], config)
+        score = row.get("success_once", float(iteration))  # without evaluations the latest wins
+        if score > best:
+            best, chosen = score, candidate
+        history.append(row)
+        if progress:
+            progress(row)
+    return *chosen, history
+
+
+def _finished(policy: Policy, encoder: Encoder, demos: Demos, pictures: Pictures) -> tuple[Policy, Encoder]:
+    """Copies as they will be used: weights rounded to bfloat16, the normaliser fitted to the features."""
+    encoder = rounded(_copy(encoder, Encoder(encoder.view)))
+    policy = _copy(policy, type(policy)(policy.config))
+    renormalise(policy, encoded(demos, pictures, encoder).observations)
+    return rounded(policy), encoder.requires_grad_(False)
+
+
+def _copy(module: nn.Module, fresh: nn.Module) -> nn.Module:
+    fresh.load_state_dict(module.state_dict())
+    return fresh.eval()
+
+
+@torch.no_grad()
+def rounded(module: nn.Module) -> nn.Module:
+    """The module with its parameters (not its buffers) rounded to what bfloat16 can hold; they stay float32."""
+    for parameter in module.parameters():
+        parameter.copy_(parameter.bfloat16())
+    return module
+
+
+@torch.no_grad()
+def renormalise(policy: Policy, observations: np.ndarray) -> None:
+    """Fit the normaliser of an MLP or BeT to observations (N, obs_dim), and change its first layer so that the policy stays the same.
+
+    With x = mean + std n the layer W (x - mean0) / std0 + b becomes W (std / std0) n + b + W (mean - mean0) / std0.
+    """
+    layer = policy.net[0] if isinstance(policy, MLP) else policy.gpt.inp
+    assert isinstance(policy, MLP | BeT)
+    mean, std = policy.normalizer.mean.clone(), policy.normalizer.std.clone()
+    policy.normalizer.fit(observations)
+    layer.bias += layer.weight @ ((policy.normalizer.mean - mean) / std)
+    layer.weight *= policy.normalizer.std / std

@@ -1,0 +1,87 @@
+"""The derived task for online RL: a simulation that draws, encodes with a frozen encoder and shows the robot's state and features.
+
+    observation   the robot's own state, then 256 features of the frame: a flat vector like any other
+    so            replay, critic, residual, decorator, evaluation and recording work as they are; no picture is ever stored
+
+That is what the paper's code does (facts.md 1.3): residual and critic see the frozen base encoder's features and the latest state.
+"""
+from __future__ import annotations
+
+import contextlib
+import copy
+import functools
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from ..policies import Policy, save_policy
+from ..tasks.spec import TaskSpec
+from .encoders import FEATURES, Encoder, load_encoder, save_encoder
+from .sim import Frame, PixelSim, panels
+
+ENCODER = "encoder"  # folder inside a visual policy's
+
+
+class FeatureSim:
+    """A simulation whose observations are robot state and features; see `Sim`."""
+
+    def __init__(self, spec: TaskSpec, encoder: Encoder, render: bool = False):
+        self._sim, self._encoder = PixelSim(spec, encoder.view), encoder
+
+    def reset(self, seed: int) -> np.ndarray:
+        return self._observe(self._sim.reset(seed))
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, bool]:
+        frame, solved = self._sim.step(action)
+        return self._observe(frame), solved
+
+    def _observe(self, frame: Frame) -> np.ndarray:
+        self._frame = frame
+        with one_thread():
+            features = self._encoder.encode(frame.rgb[None], frame.depth[None])[0]
+        return np.concatenate([frame.state, features])
+
+    def render(self) -> np.ndarray:
+        """What the policy sees: its cameras side by side, enlarged."""
+        return panels(self._frame.rgb).repeat(2, axis=0).repeat(2, axis=1)
+
+    def close(self) -> None:
+        self._sim.close()
+
+
+@contextlib.contextmanager
+def one_thread() -> Iterator[None]:
+    """Within this block torch computes with one thread: a worker must round as this process does, and a picture is little work."""
+    threads = torch.get_num_threads()
+    if threads > 1:
+        torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        if threads > 1:
+            torch.set_num_threads(threads)
+
+
+def pixel_spec(spec: TaskSpec, encoder: Encoder) -> TaskSpec:
+    """`spec` seen through `encoder`."""
+    return replace(spec, name=f"{spec.name}-pixels", obs_dim=encoder.view.state_dim + FEATURES,
+                   make=functools.partial(FeatureSim, spec, encoder))
+
+
+def encoder_of(folder: str | Path) -> Encoder | None:
+    """The encoder that a policy in `folder` (for a decorated one: its base policy) sees through; None for one that is told the state."""
+    found = [path for path in (Path(folder) / ENCODER, Path(folder) / "base" / ENCODER) if path.is_dir()]
+    return load_encoder(found[0]) if found else None
+
+
+def save_visual(policy: Policy, encoder: Encoder, folder: str | Path, info: dict[str, Any]) -> None:
+    """Write a policy that `imitate_pixels` trained, its encoder in a folder inside. Weights are stored as bfloat16, which they fit."""
+    halved = copy.deepcopy(policy)
+    for parameter in halved.parameters():
+        parameter.data = parameter.data.bfloat16()
+    save_policy(halved, folder, info)
+    save_encoder(encoder, Path(folder) / ENCODER)
