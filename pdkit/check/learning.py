@@ -1,144 +1,12 @@
-"""Checks of the exercises in the notebooks: each takes the student's function and names the likely mistake.
-
-A check prints one line and returns whether the exercise is solved; it never raises, so that an unsolved notebook runs to
-its end, unless `strict` is set (for grading): then what is wrong is a PdkitError.
-"""
+"""Exercises about learning online, and why it fails (notebooks 05 to 12)."""
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import torch
-from scipy import stats as scipy_stats
 
-from . import base_analysis, pixel_analysis, stats
-from .errors import PdkitError
-from .policies import bet
-
-
-def _judge(name: str, complaints: Callable[[], Iterator[str]], strict: bool) -> bool:
-    """Print the verdict of `complaints`, which yields sentences about what is wrong; True if there is none."""
-    try:
-        wrong = next(complaints(), None)
-    except NotImplementedError:
-        wrong = "it is still to be written."
-    except Exception as error:  # whatever a student's code may raise
-        wrong = f"it raised {type(error).__name__}: {error}"
-    if wrong is None:
-        print(f"[solved] {name}")
-        return True
-    if strict:
-        raise PdkitError(f"The exercise {name} is not solved: {wrong}")
-    print(f"[not yet] {name}: {wrong}")
-    return False
-
-
-def first_success(answer: Callable, strict: bool = False) -> bool:
-    """01: the step, counted from 1, after which an episode was first solved; None if never."""
-    def complaints() -> Iterator[str]:
-        cases = (([0, 0, 1, 1], 3), ([1, 0, 0], 1), ([0, 1, 0], 2), ([0, 0, 0], None))
-        for success, expected in cases:
-            got = answer(np.array(success, bool))
-            if got == expected and (got is None) == (expected is None):
-                continue
-            if expected is None:
-                yield f"an episode that is never solved gives {got!r}, not None; argmax of all False is 0."
-            elif got == expected - 1:
-                yield f"for {success} it gives {got}: steps are counted from 1."
-            else:
-                yield f"for {success} it gives {got!r}, not {expected}."
-
-    return _judge("first_success", complaints, strict)
-
-
-def focal_loss(answer: Callable, strict: bool = False) -> bool:
-    """02: the mean of -(1 - p)^gamma log p for logits (B, K) and true classes (B,)."""
-    def complaints() -> Iterator[str]:
-        generator = torch.Generator().manual_seed(0)
-        logits, target = torch.randn((16, 5), generator=generator), torch.arange(16) % 5
-        for gamma in (0.0, 2.0):
-            got, expected = float(answer(logits, target, gamma)), float(bet.focal_loss(logits, target, gamma))
-            if abs(got - expected) < 1e-4 * expected:
-                continue
-            cross_entropy = float(bet.focal_loss(logits, target, 0.0))
-            if gamma and abs(got - cross_entropy) < 1e-4:
-                yield "gamma changes nothing: where is the factor (1 - p)^gamma?"
-            elif abs(got + expected) < 1e-4:
-                yield "the sign is wrong: log p is negative, a loss is positive."
-            elif abs(got - 16 * expected) < 1e-3:
-                yield "it is 16 times too large for a batch of 16: take the mean, not the sum."
-            else:
-                yield f"with gamma {gamma:g} it gives {got:.4f}, not {expected:.4f}."
-        extreme = float(answer(torch.tensor([[-200.0, 200.0]]), torch.tensor([0]), 2.0))
-        if not np.isfinite(extreme):
-            yield "it is not finite for a very unlikely true bin; use log_softmax instead of log(softmax)."
-
-    return _judge("focal_loss", complaints, strict)
-
-
-def ddim_step(answer: Callable, strict: bool = False) -> bool:
-    """03: from noisy actions x (T, act_dim), predicted noise, and abar here and at the next step: the actions at the next step."""
-    def complaints() -> Iterator[str]:
-        generator = torch.Generator().manual_seed(0)
-        x, noise = torch.randn((2, 8, 2), generator=generator)
-        for here, after in ((0.5, 0.9), (0.02, 0.3), (0.8, 1.0)):
-            clean = ((x - (1 - here) ** 0.5 * noise) / here**0.5)
-            expected = after**0.5 * clean.clamp(-1, 1) + (1 - after) ** 0.5 * noise
-            got = torch.as_tensor(np.asarray(answer(x.clone(), noise.clone(), here, after), np.float32))
-            if got.shape != expected.shape:
-                yield f"it gives shape {tuple(got.shape)}, not {tuple(expected.shape)}."
-            elif torch.allclose(got, expected, atol=1e-4):
-                continue
-            elif torch.allclose(got, after**0.5 * clean + (1 - after) ** 0.5 * noise, atol=1e-4):
-                yield "the clean actions leave [-1, 1]: clip them first, or a small error in the noise explodes where abar is small."
-            elif torch.allclose(got, clean.clamp(-1, 1), atol=1e-4):
-                yield "these are the clean actions: put the noise of the next step back in."
-            else:
-                yield f"with abar {here:g} and then {after:g} the first number is {got[0, 0]:.3f}, not {expected[0, 0]:.3f}."
-
-    return _judge("ddim_step", complaints, strict)
-
-
-def best_of(answer: Callable, strict: bool = False) -> bool:
-    """04: what the best of m evaluations of n episodes shows on average, when every policy truly solves a share p: answer(p, n, m)."""
-    def complaints() -> Iterator[str]:
-        for p, n, m in ((0.5, 1, 2), (0.5, 50, 1), (0.3, 50, 10), (0.9, 20, 5)):
-            got, expected = float(answer(p, n, m)), base_analysis.best_of(p, n, m)
-            cdf = scipy_stats.binom.cdf(np.arange(n + 1), n, p)
-            if abs(got - expected) < 0.01:  # a simulation of some thousand draws is as good
-                continue
-            mistakes = {
-                p: "that is the truth itself: the best of several shows more, because its luck was chosen with it.",
-                n * expected: "that is a number of episodes, not a share: divide by n.",
-                float(np.sum(np.diff(cdf, prepend=0.0) ** m * np.arange(n + 1)) / n):
-                    "the chance that the best is k is F(k)^m - F(k - 1)^m: take the difference after the power, not before.",
-                float(1 - (1 - p) ** m): "that is the chance that one of m episodes is solved; an evaluation has n."}
-            yield next((said for value, said in mistakes.items() if abs(got - value) < 0.01),
-                       f"for p={p:g}, n={n} and m={m} it gives {got:.3f}, not {expected:.3f}.")
-
-    return _judge("best_of", complaints, strict)
-
-
-def shift(answer: Callable, strict: bool = False) -> bool:
-    """15: a picture (H, W, C) moved down and right by whole pixels, the bared edge repeating the nearest pixels."""
-    def complaints() -> Iterator[str]:
-        picture = np.random.default_rng(0).integers(0, 255, (6, 5, 3), np.uint8)
-        for down, right in ((0, 0), (2, 0), (0, 1), (-1, -2), (2, -1)):
-            got, expected = np.asarray(answer(picture.copy(), down, right)), pixel_analysis.shifted(picture, down, right)
-            if got.shape != expected.shape:
-                yield f"moving {picture.shape} by ({down}, {right}) gives {got.shape}: the size must stay."
-            elif np.array_equal(got, expected):
-                continue
-            elif np.array_equal(got, np.roll(picture, (down, right), (0, 1))):
-                yield "what leaves on one side comes back on the other (np.roll): the bared edge must repeat the nearest pixels."
-            elif np.array_equal(got, pixel_analysis.shifted(picture, -down, -right)):
-                yield "it moves the other way: row r of the result is row r - down of the picture."
-            elif np.array_equal(got, pixel_analysis.shifted(picture, right, down)):
-                yield "down and right are exchanged: rows are the first axis."
-            else:
-                yield f"moving by ({down}, {right}) is wrong in {(got != expected).mean():.0%} of the numbers."
-
-    return _judge("shift", complaints, strict)
+from .judge import judge
 
 
 def gate(answer: Callable, strict: bool = False) -> bool:
@@ -163,7 +31,7 @@ def gate(answer: Callable, strict: bool = False) -> bool:
         if (np.asarray(answer(residual.copy(), 5000, 1000, np.random.default_rng(0))) == 0).any():
             yield "beyond H something is still off; the probability stops at 1."
 
-    return _judge("gate", complaints, strict)
+    return judge("gate", complaints, strict)
 
 
 def cosines(answer: Callable, strict: bool = False) -> bool:
@@ -184,7 +52,7 @@ def cosines(answer: Callable, strict: bool = False) -> bool:
         if not np.isfinite(got).all() or got[2] != 0:
             yield f"for a row of zeros it gives {got[2]}, not 0."
 
-    return _judge("cosines", complaints, strict)
+    return judge("cosines", complaints, strict)
 
 
 def temperature_step(answer: Callable, strict: bool = False) -> bool:
@@ -204,7 +72,7 @@ def temperature_step(answer: Callable, strict: bool = False) -> bool:
             else:
                 yield f"from {log_temperature:g} with entropy {entropy:g} it gives {got:.4f}, not {expected:.4f}."
 
-    return _judge("temperature_step", complaints, strict)
+    return judge("temperature_step", complaints, strict)
 
 
 def actors_value(answer: Callable, strict: bool = False) -> bool:
@@ -230,7 +98,7 @@ def actors_value(answer: Callable, strict: bool = False) -> bool:
         if not torch.allclose(mine[0], torch.autograd.grad(expected.sum(), action)[0], atol=1e-5):
             yield "the gradient on the action is not that of the head."
 
-    return _judge("actors_value", complaints, strict)
+    return judge("actors_value", complaints, strict)
 
 
 def conservative(answer: Callable, strict: bool = False) -> bool:
@@ -259,7 +127,7 @@ def conservative(answer: Callable, strict: bool = False) -> bool:
         if not np.isfinite(answer(data - 900, random - 900, policy - 900, log_pi, returns - 900, d)):
             yield "it is not finite for values near -900: take the largest out before the exponential (np.logaddexp.reduce does)."
 
-    return _judge("conservative", complaints, strict)
+    return judge("conservative", complaints, strict)
 
 
 def corridor_values(answer: Callable, strict: bool = False) -> bool:
@@ -277,7 +145,7 @@ def corridor_values(answer: Callable, strict: bool = False) -> bool:
             if not np.allclose(got, expected):
                 yield f"with gamma {gamma:g} the first of {length} cells is worth {expected[0]:.4f}, not {got[0]:.4f}."
 
-    return _judge("corridor_values", complaints, strict)
+    return judge("corridor_values", complaints, strict)
 
 
 def lookup(answer: Callable, strict: bool = False) -> bool:
@@ -306,7 +174,7 @@ def lookup(answer: Callable, strict: bool = False) -> bool:
             else:
                 yield f"with k={k} the first number is {got[0]:.3f}, not {expected[0]:.3f}."
 
-    return _judge("lookup", complaints, strict)
+    return judge("lookup", complaints, strict)
 
 
 def action_ascent(answer: Callable, strict: bool = False) -> bool:
@@ -342,56 +210,4 @@ def action_ascent(answer: Callable, strict: bool = False) -> bool:
             yield next((said for wrong, said in mistakes if torch.allclose(got, wrong, atol=1e-5)),
                        f"after 3 steps of 0.2 the first executed number is {float(got[1, 0]):.3f}, not {float(climbed(3)[1, 0]):.3f}.")
 
-    return _judge("action_ascent", complaints, strict)
-
-
-def ranking(answer: Callable, recorded: Mapping[str, float], strict: bool = False) -> bool:
-    """13: the recipes of `recorded` (recipe -> mean success) in the order predicted, best first; pairs closer than 10 points are ties."""
-    def complaints() -> Iterator[str]:
-        got = list(answer())
-        if sorted(got) != sorted(recorded):
-            yield f"it must name each of {', '.join(recorded)} once, and gives {got}."
-        if any(np.isnan(value) for value in recorded.values()):
-            yield "nothing is recorded to hold it against: keep your prediction, and run the sweep that is named above."
-        wrong = [(recorded[b] - recorded[a], a, b) for i, a in enumerate(got) for b in got[i + 1:] if recorded[b] - recorded[a] > 0.1]
-        if wrong:
-            gap, first, second = max(wrong)
-            yield (f"{len(wrong)} of {len(got) * (len(got) - 1) // 2} pairs came out the other way round, most clearly {first} before "
-                   f"{second}, by {100 * gap:.0f} points. Which of your reasons was wrong?")
-
-    return _judge("ranking", complaints, strict)
-
-
-def interquartile_mean(answer: Callable, strict: bool = False) -> bool:
-    """16: the mean of the middle half of all numbers of a (runs x tasks) array."""
-    def complaints() -> Iterator[str]:
-        rng = np.random.default_rng(0)
-        for shape in ((8, 1), (5, 1), (4, 3)):
-            scores = rng.random(shape) ** 3
-            got, expected = float(answer(scores.copy())), stats.iqm(scores)
-            if abs(got - expected) < 1e-9:
-                continue
-            for other, what in ((scores.mean(), "it is the mean: a single run at 0 % moves it."),
-                                (np.median(scores), "it is the median: that throws away all but one or two runs."),
-                                (np.sort(scores, axis=0)[len(scores) // 4: len(scores) - len(scores) // 4].mean(),
-                                 "it cuts each task by itself: sort all numbers together.")):
-                if abs(got - other) < 1e-9:
-                    yield what
-            yield f"for {shape[0]} runs on {shape[1]} tasks it gives {got:.4f}, not {expected:.4f}; floor(n / 4) are cut at either side."
-
-    return _judge("interquartile_mean", complaints, strict)
-
-
-def object_mean(answer: Callable, strict: bool = False) -> bool:
-    """14: mean success over objects, each counted once, from outcomes (N,) of episodes and the name of each one's object (N,)."""
-    def complaints() -> Iterator[str]:
-        cases = (([1, 1, 1, 0, 0], list("aaabb"), 0.5), ([1, 0, 0, 0, 1, 1], list("abbbbb"), 0.7), ([1, 0, 1], list("aab"), 0.75))
-        for successes, objects, expected in cases:
-            got = float(answer(np.array(successes, float), np.array(objects)))
-            if abs(got - expected) < 1e-9:
-                continue
-            if abs(got - np.mean(successes)) < 1e-9:
-                yield "it is the mean over episodes: an object that comes up more often counts more."
-            yield f"for outcomes {successes} of objects {''.join(objects)} it gives {got:.3f}, not {expected:.3f}."
-
-    return _judge("object_mean", complaints, strict)
+    return judge("action_ascent", complaints, strict)
