@@ -1,4 +1,6 @@
 """The bundled data: complete, unaltered, labelled, and what the lessons say they are."""
+from collections import Counter
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -12,7 +14,9 @@ from pdkit.profiles import online_config
 from pdkit.tasks import get_task
 
 ADROIT = ["Door", "Hammer", "Pen", "Relocate"]
-SHIPPED = dict.fromkeys(ADROIT, "agent") | {"StackCube": "scripted", "TurnFaucet": "scripted"}  # task: who made the demonstrations
+MANISKILL = ["PegInsertionSide", "StackCube", "TurnFaucet"]
+SHIPPED = dict.fromkeys(ADROIT, "agent") | dict.fromkeys(MANISKILL, "scripted")  # task: who made the demonstrations
+NOT_REPAIRED = ["PegInsertionSide"]  # decorated, it is no better than its base: the README says so
 
 
 def test_every_bundled_file_has_the_recorded_checksum():
@@ -20,7 +24,9 @@ def test_every_bundled_file_has_the_recorded_checksum():
 
 
 def test_the_repository_stays_small():
-    assert sum(p.stat().st_size for p in data_files()) < 60e6  # eight tasks are to come
+    assert sum(p.stat().st_size for p in data_files()) < 60e6
+    weights = Counter(sha256(p) for p in data_files() if p.suffix == ".safetensors")
+    assert max(weights.values()) == 1  # a copy names the folder of the first (share_weights)
 
 
 @pytest.mark.parametrize("task", SHIPPED)
@@ -123,4 +129,4 @@ def test_the_shipped_policies_are_those_of_a_recorded_row(task):
     assert (card["command"], card["decorated_success"], card["episodes"]) == (row.command, row.decorated_success, row.episodes)
     assert row.env_steps >= online_config(task, "lesson").total_steps
     assert table.base_success.nunique() == 1 and 0.2 <= row.base_success <= 0.8 and (table.episodes == 200).all()
-    assert (table.decorated_success > table.base_success + 0.15).all()
+    assert (table.decorated_success > table.base_success + 0.15).all() == (task not in NOT_REPAIRED)

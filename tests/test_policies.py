@@ -1,5 +1,6 @@
 """Base policies: Behavior Transformer piece by piece, training, and the way to disk."""
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from pdkit.demos.format import from_episodes
 from pdkit.errors import PdkitError
 from pdkit.imitate import ImitateConfig, Windows, imitate
 from pdkit.policies import POLICIES, BeT, load_policy, save_policy
+from pdkit.policies.base import share_weights
 from pdkit.policies.bet import focal_loss
 
 SMALL = dict(obs_dim=3, act_dim=2, window=4, bins=3, layers=2, heads=2, embed=16, features=16)
@@ -146,7 +148,7 @@ BAD = [  # policy, setting as typed, what the sentence must name
     ("diffusion", "diffusion_steps=0", "at least 1"), ("diffusion", "sampler_steps=4.0", "a whole number"),
     ("diffusion", "sampler=3", "a word"), ("diffusion", "prediction=x", "Unknown prediction"), ("diffusion", "late_steps=9", "from 0 to"),
     ("mlp", "hidden=0", "at least 1"), ("mlp", "hidden=x", "a whole number"), ("mlp", "layers=-1", "at least 0"),
-    ("mlp", "window=2", "one observation"),
+    ("mlp", "window=2", "one observation"), ("mlp", "std_floor=-1", "at least 0"),
     ("rnn", "window=0", "at least 1"), ("rnn", "layers=0", "at least 1"), ("rnn", "hidden=1.5", "a whole number"),
     ("cnn", "window=0", "at least 1"), ("cnn", "layers=0", "at least 1"), ("cnn", "kernel=2", "odd"), ("cnn", "hidden=-1", "at least 1"),
     ("vinn", "k=0", "at least 1"), ("vinn", "k=x", "a whole number"), ("vinn", "exclusion=-1", "at least 0"),
@@ -185,6 +187,35 @@ def test_a_tuple_is_a_list_a_whole_number_a_number_and_no_hidden_layer_a_linear_
     policy = POLICIES[kind]({"obs_dim": 3, "act_dim": 2} | settings)
     assert policy.config[next(iter(settings))] == expected
     assert policy.eval().act(np.zeros((2, policy.window, 3), np.float32)).shape == (2, policy.chunk, 2)
+
+
+def test_the_normaliser_has_a_floor_where_it_is_asked_for():
+    """Columns: never moves, moves by 0.01, moves by 2; mean 5 each."""
+    observations = (5 + np.array([[0, 0.01, 2], [0, -0.01, -2]])).astype(np.float32)
+    for floor, expected in ((0.0, [1, 0.01, 2]), (0.5, [1, 0.5, 2])):
+        policy = POLICIES["mlp"]({"obs_dim": 3, "act_dim": 1, "std_floor": floor})
+        policy.fit_statistics(observations, np.zeros((2, 1)))
+        assert policy.normalizer.std.tolist() == pytest.approx(expected, rel=1e-3) and policy.normalizer.mean.tolist() == [5, 5, 5]
+    assert policy.normalizer(torch.tensor([[5.0, 5.25, 9.0]])).tolist() == [pytest.approx([0, 0.5, 2])]
+
+
+def test_a_copy_can_use_the_weights_beside_it(tmp_path):
+    policy, other = bet(dropout=0.0).eval(), bet(dropout=0.0).eval()
+    other.normalizer.mean += 1
+    for name, one in (("base", policy), ("decorated/base", policy), ("another", other)):
+        save_policy(one, tmp_path / name)
+    copy = tmp_path / "decorated" / "base"
+    with pytest.raises(PdkitError, match="only a copy"):
+        share_weights(copy, tmp_path / "another")
+    share_weights(copy, tmp_path / "base")
+    x = np.random.default_rng(1).normal(size=(2, 4, 3)).astype(np.float32)
+    assert not (copy / "weights.safetensors").exists() and np.array_equal(load_policy(copy).act(x), policy.act(x))
+    shutil.copytree(tmp_path / "another", tmp_path / "base", dirs_exist_ok=True)
+    with pytest.raises(PdkitError, match="checksum"):  # what lies there now is something else
+        load_policy(copy)
+    shutil.rmtree(tmp_path / "base")
+    with pytest.raises(PdkitError, match="is missing"):
+        load_policy(copy)
 
 
 def test_save_and_load(tmp_path):
