@@ -9,8 +9,9 @@ from collections.abc import Callable, Iterator, Mapping
 
 import numpy as np
 import torch
+from scipy import stats as scipy_stats
 
-from . import stats
+from . import base_analysis, stats
 from .errors import PdkitError
 from .policies import bet
 
@@ -96,6 +97,26 @@ def ddim_step(answer: Callable, strict: bool = False) -> bool:
                 yield f"with abar {here:g} and then {after:g} the first number is {got[0, 0]:.3f}, not {expected[0, 0]:.3f}."
 
     return _judge("ddim_step", complaints, strict)
+
+
+def best_of(answer: Callable, strict: bool = False) -> bool:
+    """04: what the best of m evaluations of n episodes shows on average, when every policy truly solves a share p: answer(p, n, m)."""
+    def complaints() -> Iterator[str]:
+        for p, n, m in ((0.5, 1, 2), (0.5, 50, 1), (0.3, 50, 10), (0.9, 20, 5)):
+            got, expected = float(answer(p, n, m)), base_analysis.best_of(p, n, m)
+            cdf = scipy_stats.binom.cdf(np.arange(n + 1), n, p)
+            if abs(got - expected) < 0.01:  # a simulation of some thousand draws is as good
+                continue
+            mistakes = {
+                p: "that is the truth itself: the best of several shows more, because its luck was chosen with it.",
+                n * expected: "that is a number of episodes, not a share: divide by n.",
+                float(np.sum(np.diff(cdf, prepend=0.0) ** m * np.arange(n + 1)) / n):
+                    "the chance that the best is k is F(k)^m - F(k - 1)^m: take the difference after the power, not before.",
+                float(1 - (1 - p) ** m): "that is the chance that one of m episodes is solved; an evaluation has n."}
+            yield next((said for value, said in mistakes.items() if abs(got - value) < 0.01),
+                       f"for p={p:g}, n={n} and m={m} it gives {got:.3f}, not {expected:.3f}.")
+
+    return _judge("best_of", complaints, strict)
 
 
 def gate(answer: Callable, strict: bool = False) -> bool:

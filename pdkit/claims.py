@@ -22,6 +22,7 @@ import pandas as pd
 from scipy import stats
 
 from .errors import PdkitError
+from .files import DATA
 from .recorded import load
 from .stats import Interval
 
@@ -196,10 +197,18 @@ def finding(record: str, values: pd.Series, measured: str, interval: str, verdic
 
 
 def commands(record: str, tasks: Sequence[str]) -> list[str]:
-    """What makes the rows of these tasks: the column `sweep` where it is recorded."""
+    """What makes the rows of these tasks: the column `sweep` where it is recorded, else a sweep of that name, else the rows' commands."""
     table, _ = recorded(record)
-    known = table.sweep[table.task.isin(tasks)].dropna() if "sweep" in table else []
-    return sorted(set(known)) or [f"pdkit sweep data/sweeps/{record}.toml"]
+    mine, spec = table[table.task.isin(tasks)], DATA / "sweeps" / f"{record}.toml"
+    known = mine.sweep.dropna() if "sweep" in mine else []
+    if len(known) or spec.exists() or "command" not in mine:
+        return sorted(set(known)) or [f"pdkit sweep data/sweeps/{spec.name}"]
+    seeds: dict[str, list[str]] = {}  # by what commands that differ in their seed alone have in common
+    for command in dict.fromkeys(mine.command):
+        before, _, rest = command.partition(" --seeds ")
+        seed, _, after = rest.partition(" ")
+        seeds.setdefault(f"{before} --seeds {{}} {after}" if rest else command, []).append(seed)
+    return [command.replace("{}", " ".join(numbers), 1) for command, numbers in seeds.items()]
 
 
 def recorded(name: str) -> tuple[pd.DataFrame, pd.DataFrame]:

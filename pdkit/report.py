@@ -8,7 +8,8 @@ data/results/claims.csv has a row a claim:
               untested one, the paper's tasks    verdict   reproduced, partly, not or untested
                                                  command   that makes the numbers again
 
-`pdkit report --update` first computes every verdict anew for which there is a rule (pdkit/verdicts) and enough is recorded.
+`pdkit report --update` first computes every verdict anew for which there is a rule (pdkit/verdicts) and enough is recorded, and draws
+all_tasks.png.
 A claim whose verdict is not "untested" has all of them. The recorded tables beside it (a row a run, with its command) are checked
 too: a report on broken tables is refused.
 """
@@ -22,10 +23,11 @@ from pathlib import Path
 
 import pandas as pd
 
-from . import page, verdicts
+from . import page, plots_range, task_range, verdicts
 from .cli import Parser
 from .errors import PdkitError
 from .files import DATA, atomic_file, runs_root
+from .plots import Picture
 from .recorded import KEYS
 
 COLUMNS = ["claim", "section", "tasks", "seeds", "measured", "interval", "verdict", "command"]
@@ -124,6 +126,8 @@ def sections(claims: pd.DataFrame, tables: dict[str, pd.DataFrame], folder: Path
     """The page: counts, tested claims, untested ones, and the recorded tables."""
     tested, rest = claims[claims.verdict != "untested"], claims[claims.verdict == "untested"]
     parts = [page.Section("Verdicts", [page.numbers([(str(n), verdict, VERDICTS[verdict]) for verdict, n in counts(claims).items()])])]
+    if "main_job" in tables:
+        parts.append(page.Section("All tasks", [page.figure(_range(tables["main_job"]), "base and decorated policies of the main job")]))
     parts.append(page.Section("Tested", [page.table(tested.to_dict("records")) if len(tested) else "Nothing yet."]))
     if len(rest):
         parts.append(page.Section("Untested", [page.table(rest[["claim", "section", "tasks"]].to_dict("records"))]))
@@ -137,6 +141,11 @@ def sections(claims: pd.DataFrame, tables: dict[str, pd.DataFrame], folder: Path
     return parts
 
 
+def _range(table: pd.DataFrame) -> Picture:
+    tasks = task_range.by_task(table)
+    return plots_range.range_figure(tasks, task_range.averages(tasks), "Base policies and decorated ones, best evaluation of a run")
+
+
 def main(argv: list[str]) -> int:
     """`pdkit report [--update] [--out FILE]`; 1 when something in the claims or the tables is wrong, which is then listed."""
     parser = Parser(prog="pdkit report", description="List the paper's claims with what was measured, and write a page.")
@@ -148,6 +157,9 @@ def main(argv: list[str]) -> int:
         claims = verdicts.updated(load_claims(folder / "claims.csv"))
         with atomic_file(folder / "claims.csv") as temporary:
             claims.to_csv(temporary, index=False)
+        if (folder / "main_job.csv").exists():
+            with atomic_file(folder / "all_tasks.png") as temporary:
+                _range(_read(folder / "main_job.csv")).savefig(temporary, dpi=130)
     claims, tables = load_claims(folder / "claims.csv"), recorded_tables(folder)
     problems = claim_problems(claims)
     for name, table in tables.items():

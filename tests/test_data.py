@@ -1,4 +1,6 @@
 """The bundled data: complete, unaltered, labelled, and what the lessons say they are."""
+from collections import Counter
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -12,7 +14,9 @@ from pdkit.profiles import online_config
 from pdkit.tasks import get_task
 
 ADROIT = ["Door", "Hammer", "Pen", "Relocate"]
-SHIPPED = dict.fromkeys(ADROIT, "agent") | {"StackCube": "scripted", "TurnFaucet": "scripted"}  # task: who made the demonstrations
+MANISKILL = ["PegInsertionSide", "StackCube", "TurnFaucet"]
+SHIPPED = dict.fromkeys(ADROIT, "agent") | dict.fromkeys(MANISKILL, "scripted")  # task: who made the demonstrations
+NOT_REPAIRED = ["PegInsertionSide"]  # decorated, it is no better than its base: the README says so
 
 
 def test_every_bundled_file_has_the_recorded_checksum():
@@ -20,7 +24,9 @@ def test_every_bundled_file_has_the_recorded_checksum():
 
 
 def test_the_repository_stays_small():
-    assert sum(p.stat().st_size for p in data_files()) < 60e6  # eight tasks are to come
+    assert sum(p.stat().st_size for p in data_files()) < 60e6
+    weights = Counter(sha256(p) for p in data_files() if p.suffix == ".safetensors")
+    assert max(weights.values()) == 1  # a copy names the folder of the first (share_weights)
 
 
 @pytest.mark.parametrize("task", SHIPPED)
@@ -77,6 +83,24 @@ def test_checkpoints_load_and_fit_the_task(task):
     assert decorated.config == online_config(task, "lesson").decorator
 
 
+@pytest.mark.parametrize("kind", ["rnn", "cnn", "diffusion"])
+def test_other_base_policies_of_the_cube_leave_something_to_improve(kind):
+    folder, spec = DATA / "checkpoints" / "StackCube" / kind, get_task("StackCube")
+    policy, card = load_policy(folder), read_json(folder / "policy.json")["info"]
+    assert policy.kind == kind and (policy.config["obs_dim"], policy.config["act_dim"]) == (spec.obs_dim, spec.act_dim)
+    assert card["demos_checksum"] == sources.bundled("StackCube").first(card["demos"]).checksum
+    assert 0.2 <= card["selected"]["success_once"] <= 0.8 and f"--policy {kind}" in card["command"]
+    assert kind == "diffusion" or (folder / "weights.safetensors").stat().st_size < 0.7e6
+
+
+def test_the_recorded_base_policies_are_the_shipped_ones():
+    """By their success on the same test episodes, in every seed; a base that has little to improve would decide nothing."""
+    table = pd.read_csv(DATA / "results" / "base_policies.csv")
+    assert table.command.str.contains("--base data/checkpoints/StackCube/").all() and {"rnn"} <= set(table.recipe)
+    assert (table.groupby("recipe").base_success.nunique() == 1).all() and table.base_success.between(0.2, 0.8).all()
+    assert table.groupby("recipe").policy.first().to_dict() == {name: name for name in set(table.recipe)}
+
+
 @pytest.mark.parametrize("card", sorted((DATA / "checkpoints").rglob("decorated.json")), ids=lambda path: "-".join(path.parts[-3:-1]))
 def test_every_decorated_checkpoint_loads(card):
     policy = load_decorated(card.parent)
@@ -105,4 +129,4 @@ def test_the_shipped_policies_are_those_of_a_recorded_row(task):
     assert (card["command"], card["decorated_success"], card["episodes"]) == (row.command, row.decorated_success, row.episodes)
     assert row.env_steps >= online_config(task, "lesson").total_steps
     assert table.base_success.nunique() == 1 and 0.2 <= row.base_success <= 0.8 and (table.episodes == 200).all()
-    assert (table.decorated_success > table.base_success + 0.15).all()
+    assert (table.decorated_success > table.base_success + 0.15).all() == (task not in NOT_REPAIRED)

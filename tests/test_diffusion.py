@@ -125,7 +125,7 @@ def test_the_samplers_own_noise_comes_from_the_cpus_generator(monkeypatch):
     (dict(horizon=7), "multiple of 2"), (dict(chunk=8), "fit between"), (dict(chunk=0), "at least 1"),
     (dict(dims=[10, 32]), "multiples of"), (dict(sampler="euler"), "Unknown sampler"), (dict(prediction="x"), "Unknown prediction"),
     (dict(spacing="x"), "Unknown spacing"),
-    (dict(sampler_steps=0), "from 1 to"), (dict(sampler_steps=101), "from 1 to")])
+    (dict(sampler_steps=0), "at least 1"), (dict(sampler_steps=101), "from 1 to")])
 def test_settings_that_do_not_fit_are_refused(changes, message):
     with pytest.raises(PdkitError, match=message):
         policy(**changes)

@@ -163,7 +163,7 @@ def test_residual_rl_and_fish(tmp_path):
     result = run("11", tmp_path, alpha=0.05, ks="[2]")
     assert result["stray"]["decorator"] < result["stray"]["bound alone"] < result["stray"]["residual RL"]
     assert set(result["first"]) == {"base policy", *result["stray"]} and result["early"] in ("reproduced", "partly", "not", "untested")
-    assert set(result["vinn"]) == {f"{features},{row}" for features in ("raw", "GPT") for row in ("k=2", "k=1,exclusion=3")}
+    assert set(result["vinn"]) == {f"{features},{row}" for features in ("raw", "GPT", "FiLM") for row in ("k=2", "k=1,exclusion=3")}
     assert 0 < result["late_ratio"]["policy_decorator"] < 0.05 < result["late_ratio"]["residual_rl"]
     assert result["transport"]["all episodes"] > 0.5 and result["exercise_solved"] is False
     assert (tmp_path / "vinn.png").exists() and not (tmp_path / "episodes.png").exists()
@@ -208,6 +208,15 @@ def test_diffusion_lesson(tmp_path):
     result = run("03_diffusion_policy", tmp_path)
     assert set(result["fork"]) == {"MLP", "BeT", "Diffusion Policy"} and set(result["stack_cube"]) == {"chunk 4, DDIM 4", "DDIM 1"}
     assert all(0 <= part["low"] <= part["value"] <= part["high"] <= 1 for part in result["fork"].values())
+
+
+def test_other_base_policies(tmp_path):
+    result = run("04", tmp_path, families='["MLP", "CNN"]', ks="[2]")
+    assert set(result["curves"]) == set(result["chosen"]) == {"MLP", "CNN"} and all(len(c) == 2 for c in result["curves"].values())
+    assert set(result["parameters"]) == {"MLP", "BC-RNN", "CNN", "BeT", "Diffusion Policy"} and result["ms_step"]["MLP"] > 0
+    assert result["doubtful"]["Door"] < result["doubtful"]["StackCube"] and result["two_groups"]["StackCube"] > 0.9
+    assert all(set(rates) == {"2"} for rates in result["neighbours"].values()) and len(result["claims"]) == 4
+    assert (tmp_path / "gains.png").exists() and result["exercise_solved"] is False
 
 
 def test_finetuning_diffusion(tmp_path):

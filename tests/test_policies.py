@@ -1,14 +1,17 @@
 """Base policies: Behavior Transformer piece by piece, training, and the way to disk."""
 import json
+import shutil
 
 import numpy as np
 import pytest
 import torch
 
+from pdkit import train
 from pdkit.demos.format import from_episodes
 from pdkit.errors import PdkitError
 from pdkit.imitate import ImitateConfig, Windows, imitate
-from pdkit.policies import BeT, load_policy, save_policy
+from pdkit.policies import POLICIES, BeT, load_policy, save_policy
+from pdkit.policies.base import share_weights
 from pdkit.policies.bet import focal_loss
 
 SMALL = dict(obs_dim=3, act_dim=2, window=4, bins=3, layers=2, heads=2, embed=16, features=16)
@@ -129,6 +132,90 @@ def test_imitation_learns(kind, config, lr):
     predicted = policy.act(observations.numpy())[:, 0, 0]
     assert (np.sign(predicted) == np.sign(actions[:, -1, 0].numpy())).mean() > 0.95
     assert len(history) == 1 and history[0]["loss"] < 5
+
+
+BAD = [  # policy, setting as typed, what the sentence must name
+    ("bet", "embed=30", "multiple of its heads"), ("bet", "heads=0", "at least 1"), ("bet", "window=0", "at least 1"),
+    ("bet", "bins=0", "at least 1"), ("bet", "layers=0", "at least 1"), ("bet", "embed=-8", "at least 1"), ("bet", "dropout=1", "below 1"),
+    ("bet", "dropout=-0.1", "at least 0"), ("bet", "window=2.0", "a whole number"), ("bet", "layers=True", "a whole number"),
+    ("bet", "act_dropout=1", "True or False"), ("bet", "focal_gamma=none", "a number"), ("bet", "offset_weight=1e999", "a number"),
+    ("bet-sac", "scale=[0.5]", "28 factors"), ("bet-sac", "scale=0.5", "a list"), ("bet-sac", "scale=['x']", "a list"),
+    ("bet-sac", "lora=-1", "at least 0"), ("bet-sac", "lora=x", "a whole number"),
+    ("diffusion", "kernel=4", "odd"), ("diffusion", "kernel=0", "at least 1"), ("diffusion", "groups=0", "at least 1"),
+    ("diffusion", "embed=2", "at least 4"), ("diffusion", "embed=5", "even"), ("diffusion", "dims=[]", "a list"),
+    ("diffusion", "dims=64", "a list"), ("diffusion", "dims=[64,0]", "at least 1"), ("diffusion", "dims=[64,1.5]", "a list"),
+    ("diffusion", "dims=[64,'x']", "a list"), ("diffusion", "window=0", "at least 1"), ("diffusion", "horizon=0", "at least 1"),
+    ("diffusion", "diffusion_steps=0", "at least 1"), ("diffusion", "sampler_steps=4.0", "a whole number"),
+    ("diffusion", "sampler=3", "a word"), ("diffusion", "prediction=x", "Unknown prediction"), ("diffusion", "late_steps=9", "from 0 to"),
+    ("mlp", "hidden=0", "at least 1"), ("mlp", "hidden=x", "a whole number"), ("mlp", "layers=-1", "at least 0"),
+    ("mlp", "window=2", "one observation"),
+    ("rnn", "window=0", "at least 1"), ("rnn", "layers=0", "at least 1"), ("rnn", "hidden=1.5", "a whole number"),
+    ("cnn", "window=0", "at least 1"), ("cnn", "layers=0", "at least 1"), ("cnn", "kernel=2", "odd"), ("cnn", "hidden=-1", "at least 1"),
+    ("vinn", "k=0", "at least 1"), ("vinn", "k=x", "a whole number"), ("vinn", "exclusion=-1", "at least 0"),
+    ("vinn", "rows=-1", "at least 0"), ("vinn", "tolerance=0", "at least 1"), ("vinn", "history=0", "at least 1"),
+    ("vinn", "representation=3", "raw"), ("vinn", "representation={}", "raw"),
+    ("zero", "chunk=0", "at least 1"), ("zero", "window=[]", "a whole number"),
+]
+
+
+@pytest.mark.parametrize(("kind", "setting", "message"), BAD)
+def test_a_bad_setting_is_one_sentence_before_anything_is_trained(kind, setting, message, tmp_path):
+    words = ["base", "Door", "--policy", kind, "--num-demos", "1", "--out", str(tmp_path / "p"), "--set", setting, "eval_episodes=0"]
+    with pytest.raises(PdkitError, match=message) as error:
+        train.main(words)
+    assert "\n" not in str(error.value) and setting.partition("=")[0] in str(error.value) and not (tmp_path / "p").exists()
+
+
+def test_the_policy_that_does_nothing_has_nothing_to_learn(tmp_path):
+    assert train.main(["base", "Door", "--policy", "zero", "--num-demos", "1", "--out", str(tmp_path), "--set", "eval_episodes=0"]) == 0
+    policy = load_policy(tmp_path)
+    assert policy.kind == "zero" and not policy.act(np.ones((2, 1, 39), np.float32)).any()
+    assert policy.normalizer.std.std() > 0  # fitted to the demonstrations
+
+
+def test_every_policy_and_each_of_its_whole_numbers_is_among_the_bad_settings():
+    assert {kind for kind, _, _ in BAD} == set(POLICIES)
+    for kind, policy in POLICIES.items():
+        for name in (name for name, value in policy.defaults.items() if type(value) is int):
+            with pytest.raises(PdkitError, match=f"{kind}'s {name} must be"):
+                policy({"obs_dim": 3, "act_dim": 2, name: -1})
+
+
+@pytest.mark.parametrize(("kind", "settings", "expected"), [
+    ("diffusion", dict(dims=(16, 32)), [16, 32]), ("bet", dict(offset_weight=10), 10), ("mlp", dict(layers=0), 0)])
+def test_a_tuple_is_a_list_a_whole_number_a_number_and_no_hidden_layer_a_linear_policy(kind, settings, expected):
+    policy = POLICIES[kind]({"obs_dim": 3, "act_dim": 2} | settings)
+    assert policy.config[next(iter(settings))] == expected
+    assert policy.eval().act(np.zeros((2, policy.window, 3), np.float32)).shape == (2, policy.chunk, 2)
+
+
+def test_the_normaliser_has_a_floor_where_it_is_asked_for():
+    """Columns: never moves, moves by 0.01, moves by 2; mean 5 each."""
+    observations = (5 + np.array([[0, 0.01, 2], [0, -0.01, -2]])).astype(np.float32)
+    for floor, expected in ((0.0, [1, 0.01, 2]), (0.5, [1, 0.5, 2])):
+        policy = POLICIES["mlp"]({"obs_dim": 3, "act_dim": 1, "std_floor": floor})
+        policy.fit_statistics(observations, np.zeros((2, 1)))
+        assert policy.normalizer.std.tolist() == pytest.approx(expected, rel=1e-3) and policy.normalizer.mean.tolist() == [5, 5, 5]
+    assert policy.normalizer(torch.tensor([[5.0, 5.25, 9.0]])).tolist() == [pytest.approx([0, 0.5, 2])]
+
+
+def test_a_copy_can_use_the_weights_beside_it(tmp_path):
+    policy, other = bet(dropout=0.0).eval(), bet(dropout=0.0).eval()
+    other.normalizer.mean += 1
+    for name, one in (("base", policy), ("decorated/base", policy), ("another", other)):
+        save_policy(one, tmp_path / name)
+    copy = tmp_path / "decorated" / "base"
+    with pytest.raises(PdkitError, match="only a copy"):
+        share_weights(copy, tmp_path / "another")
+    share_weights(copy, tmp_path / "base")
+    x = np.random.default_rng(1).normal(size=(2, 4, 3)).astype(np.float32)
+    assert not (copy / "weights.safetensors").exists() and np.array_equal(load_policy(copy).act(x), policy.act(x))
+    shutil.copytree(tmp_path / "another", tmp_path / "base", dirs_exist_ok=True)
+    with pytest.raises(PdkitError, match="checksum"):  # what lies there now is something else
+        load_policy(copy)
+    shutil.rmtree(tmp_path / "base")
+    with pytest.raises(PdkitError, match="is missing"):
+        load_policy(copy)
 
 
 def test_save_and_load(tmp_path):

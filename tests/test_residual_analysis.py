@@ -135,8 +135,9 @@ def test_another_seed_has_other_demonstrations():
 def test_lookups_are_the_rows_of_the_table():
     assert analysis.lookups([5], 2) == {
         "raw,k=5": {"features": "raw", "k": 5}, "raw,k=1,exclusion=2": {"features": "raw", "k": 1, "exclusion": 2},
-        "GPT,k=5": {"features": "GPT", "k": 5}, "GPT,k=1,exclusion=2": {"features": "GPT", "k": 1, "exclusion": 2}}
-    assert list(analysis.lookups([1, 3], 0)) == ["raw,k=1", "raw,k=3", "GPT,k=1", "GPT,k=3"]
+        "GPT,k=5": {"features": "GPT", "k": 5}, "GPT,k=1,exclusion=2": {"features": "GPT", "k": 1, "exclusion": 2},
+        "FiLM,k=5": {"features": "FiLM", "k": 5}, "FiLM,k=1,exclusion=2": {"features": "FiLM", "k": 1, "exclusion": 2}}
+    assert list(analysis.lookups([1, 3], 0)) == ["raw,k=1", "raw,k=3", "GPT,k=1", "GPT,k=3", "FiLM,k=1", "FiLM,k=3"]
     for ks, exclusion in (([0], 3), ([5, 5], 3), ([], 3), ([1], -1)):
         with pytest.raises(PdkitError, match="neighbours"):
             analysis.lookups(ks, exclusion)
@@ -192,6 +193,16 @@ def test_table_11_is_judged_at_the_best_k_against_half_of_the_bet(results, vinn,
     assert found[:2] == (verdict, "Door") and "GPT,k=5, the best of 2" in found[2]
     table.iloc[:2].to_csv(results / "vinn.csv", index=False)
     assert verdict_of("VINN on features of the BeT's GPT") is None
+
+
+def test_table_12_is_judged_by_its_own_features_and_the_same_yardstick(results):
+    rows = pd.DataFrame({"task": "x", "recipe": "vinn", "seed": range(3), "vinn.GPT,k=5.value": 0.0, "vinn.FiLM,k=1.value": [0.5, 0.9, 0.8],
+                         "bet.value": 0.9})
+    rows.to_csv(results / "vinn.csv", index=False)
+    found = verdict_of("VINN on features of the Diffusion Policy's FiLM")
+    assert found[0] == "not" and "FiLM,k=1, the best of 1, 73.3 %" in found[2]
+    rows.drop(columns="vinn.FiLM,k=1.value").to_csv(results / "vinn.csv", index=False)
+    assert verdict_of("VINN on features of the Diffusion Policy's FiLM") is None
 
 
 def test_table_11_reproduced_on_all_tasks_only(results, monkeypatch):

@@ -12,8 +12,10 @@ from pdkit import train
 from pdkit.demos.sources import bundled
 from pdkit.errors import PdkitError
 from pdkit.imitate import ImitateConfig, Windows, imitate
-from pdkit.policies import MLP, VINN, BeT, load_policy, save_policy
+from pdkit.policies import MLP, VINN, BeT, DiffusionPolicy, load_policy, save_policy
+from pdkit.policies.unet import FiLMBlock
 
+UNET = dict(horizon=4, chunk=2, window=2, dims=[8, 16], groups=4, embed=8)
 TINY = dict(window=3, bins=4, layers=1, heads=2, embed=16, features=8, dropout=0.3)
 
 
@@ -82,7 +84,7 @@ def test_the_start_of_an_episode_is_no_decision():
 
 def remembered(demos, bet=None, folder=None, **config):
     if bet is not None and folder is None:
-        config["representation"] = bet.config
+        config["representation"] = {"kind": "bet"} | bet.config
     elif folder is not None:
         save_policy(bet, folder)
         config["representation"] = str(folder)
@@ -107,6 +109,45 @@ def test_features_of_a_trained_behavior_transformer(tmp_path):
         wanted = expected.gpt(expected.normalizer(windows))[:, -1]
     assert policy.window == 3 and torch.allclose(policy.library, wanted, atol=1e-5) and torch.equal(policy.actions, actions)
     assert np.allclose(policy.train().act(windows.numpy())[:, 0], actions)  # no dropout, even while something trains
+
+
+def test_film_features_are_the_scales_and_shifts_that_the_blocks_get_less_the_steps_part():
+    """Watched in the network itself, at two diffusion steps: the same up to a constant, in the order of its blocks."""
+    demos = reach_demos(6)
+    diffusion = clone(DiffusionPolicy, demos, UNET, iterations=20)
+    policy = VINN({"obs_dim": 4, "act_dim": 2, "representation": {"kind": "diffusion"} | diffusion.config})
+    policy.film, policy.normalizer = diffusion.film(), diffusion.normalizer
+    windows, seen = Windows(demos, 2, True).all()[0], {}
+    for step in (0, 99):
+        seen[step] = []
+        blocks = [block.film for block in diffusion.unet.modules() if isinstance(block, FiLMBlock)]
+        hooks = [layer.register_forward_hook(lambda _, __, out, step=step: seen[step].append(out)) for layer in blocks]
+        with torch.no_grad():
+            diffusion.unet(torch.zeros(len(windows), 4, 2), torch.full((len(windows),), step), diffusion.condition(windows))
+        for hook in hooks:
+            hook.remove()
+    with torch.no_grad():
+        found = policy.features(windows)
+    assert found.shape == (len(windows), 2 * (2 * 8 + 2 * 16 + 2 * 16 + 2 * 8)) and policy.feature_dim == found.shape[1]
+    for step in (0, 99):
+        rest = torch.cat(seen[step], dim=1) - found
+        assert torch.allclose(rest, rest[:1].expand_as(rest), atol=1e-5) and rest.abs().max() > 0.01
+
+
+def test_film_features_from_disk_and_back(tmp_path):
+    demos = reach_demos(6)
+    diffusion = clone(DiffusionPolicy, demos, UNET, iterations=20)
+    diffusion.normalizer.mean += 1.0  # it must be this one, not one fitted anew
+    policy = remembered(demos, diffusion, tmp_path / "diffusion", k=1)
+    windows, actions = Windows(demos, 2, True).all()
+    assert policy.window == 2 and torch.equal(policy.normalizer.mean, diffusion.normalizer.mean)
+    assert torch.equal(policy.film.weight, diffusion.film().weight) and np.allclose(policy.act(windows.numpy())[:, 0], actions)
+    save_policy(policy, tmp_path / "vinn")
+    shutil.rmtree(tmp_path / "diffusion")
+    x = np.random.default_rng(0).normal(size=(20, 2, 4)).astype(np.float32)
+    again = load_policy(tmp_path / "vinn")
+    assert np.array_equal(again.act(x), policy.act(x)) and again.config["representation"]["kind"] == "diffusion"
+    assert sorted(name for name in again.state_dict() if name.startswith(("film", "unet"))) == ["film.weight"]
 
 
 def test_save_and_load_needs_no_other_folder(tmp_path):
@@ -143,8 +184,10 @@ def test_bad_configurations_are_told(tmp_path):
     with pytest.raises(PdkitError, match="no demonstrations"):
         act(VINN({"obs_dim": 1, "act_dim": 1}), 0.0)
     save_policy(MLP({"obs_dim": 1, "act_dim": 1, "hidden": 4}), tmp_path / "mlp")
-    with pytest.raises(PdkitError, match="kind bet, not mlp"):
+    with pytest.raises(PdkitError, match="kind bet or diffusion, not mlp"):
         lookup(representation=str(tmp_path / "mlp"))
+    with pytest.raises(PdkitError, match="nowhere"):
+        lookup(representation=str(tmp_path / "nowhere"))
     save_policy(BeT({"obs_dim": 4, "act_dim": 2} | TINY), tmp_path / "bet")
     with pytest.raises(PdkitError, match="same task"):
         lookup(representation=str(tmp_path / "bet"))

@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import itertools
+import os
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +13,10 @@ from torch import nn
 from ..errors import PdkitError, unknown
 from ..files import atomic_folder, read_json, sha256, write_json
 from ..tasks.spec import TaskSpec
+from .settings import checked_settings
 
 FORMAT = "pdkit-policy-1"
+WEIGHTS = "weights.safetensors"
 
 
 class Normalizer(nn.Module):
@@ -25,11 +28,15 @@ class Normalizer(nn.Module):
         self.register_buffer("std", torch.ones(dim))
 
     @torch.no_grad()
-    def fit(self, observations: np.ndarray) -> None:
-        """From observations (N, dim). A dimension that never varies is passed through unscaled."""
+    def fit(self, observations: np.ndarray, floor: float = 0.0) -> None:
+        """From observations (N, dim). A dimension that never varies is passed through unscaled.
+
+        No deviation is taken to be below `floor`: joints that the demonstrations hardly move would otherwise be what a policy sees
+        best, and lead it astray as soon as they move a little more.
+        """
         std = observations.std(axis=0)
         self.mean.copy_(torch.from_numpy(observations.mean(axis=0)))
-        self.std.copy_(torch.from_numpy(np.where(std < 1e-4, 1.0, std)))
+        self.std.copy_(torch.from_numpy(np.where(std < 1e-4, 1.0, np.maximum(std, floor))))
 
     def forward(self, observations: torch.Tensor) -> torch.Tensor:
         return (observations - self.mean) / self.std
@@ -48,10 +55,13 @@ class Policy(nn.Module):
     horizon = 0  # actions it learns from the first observation of a window on; 0: one for each observation
     recipe: dict[str, Any] = {}  # how it is trained where that differs from the defaults of ImitateConfig
     learns = True  # by gradient steps on `loss`; otherwise `remember` is all there is
+    defaults: dict[str, Any] = {}  # of its settings; each must be of its default's type
+    least: dict[str, float] = {}  # the least values of settings, where not the usual ones (settings.py)
 
     def __init__(self, config: dict[str, Any]):
         super().__init__()
-        self.config = config  # everything its constructor needs, JSON types only
+        # Everything its constructor needs, JSON types only.
+        self.config = checked_settings(self.kind, self.defaults | config, self.defaults, self.least)
 
     @classmethod
     def for_task(cls, spec: TaskSpec) -> dict[str, Any]:
@@ -100,10 +110,23 @@ def save_policy(policy: Policy, folder: str | Path, info: dict[str, Any] | None 
     folder = Path(folder)
     with atomic_folder(folder) as temporary:
         save_file({name: tensor.detach().cpu().contiguous() for name, tensor in policy.state_dict().items()},
-                  temporary / "weights.safetensors")
+                  temporary / WEIGHTS)
         card = {"format": FORMAT, "kind": policy.kind, "config": policy.config,
-                "weights_sha256": sha256(temporary / "weights.safetensors"), "info": info or {}}
+                "weights_sha256": sha256(temporary / WEIGHTS), "info": info or {}}
         write_json(temporary / "policy.json", card)
+
+
+def share_weights(folder: str | Path, other: str | Path) -> None:
+    """Let the policy in `folder` use the weights file of the policy in `other`, which must be the same, and delete its own.
+
+    Raises PdkitError when they differ.
+    """
+    folder, other = Path(folder), Path(other)
+    card, theirs = read_card(folder), read_card(other)
+    if card["weights_sha256"] != theirs["weights_sha256"] or sha256(other / WEIGHTS) != card["weights_sha256"]:
+        raise PdkitError(f"{other} does not hold the weights of {folder}; only a copy can be replaced.")
+    write_json(folder / "policy.json", card | {"weights_in": os.path.relpath(other, folder)})
+    (folder / WEIGHTS).unlink(missing_ok=True)
 
 
 def read_card(folder: str | Path) -> dict[str, Any]:
@@ -129,7 +152,7 @@ def load_policy(folder: str | Path, device: str | torch.device = "cpu") -> Polic
     card = read_card(folder)
     if card["kind"] not in POLICIES:
         raise unknown("policy", card["kind"], POLICIES)
-    weights = folder / "weights.safetensors"
+    weights = folder / str(card.get("weights_in", ".")) / WEIGHTS
     if not weights.exists():
         raise PdkitError(f"{weights} is missing; copy the whole checkpoint folder or train it again with `pdkit train`.")
     if sha256(weights) != card["weights_sha256"]:

@@ -82,8 +82,10 @@ class BeT(Policy):
                                     offset_weight=1000.0, act_dropout=False)
 
     def __init__(self, config: dict[str, Any]):
-        super().__init__(self.defaults | config)
+        super().__init__(config)
         c = self.config
+        if c["dropout"] >= 1:
+            raise PdkitError(f"BeT's dropout is the share of features that is dropped; it must be below 1, not {c['dropout']}.")
         if c["embed"] % c["heads"]:
             raise PdkitError(f"BeT's embed ({c['embed']}) must be a multiple of its heads ({c['heads']}).")
         self.window = c["window"]

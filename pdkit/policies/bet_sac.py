@@ -31,6 +31,7 @@ class BeTForSAC(BeT):
 
     kind = "bet-sac"
     defaults: dict[str, Any] = BeT.defaults | dict(scale=[], lora=0)
+    least = dict(lora=0)
 
     def __init__(self, config: dict[str, Any]):
         super().__init__(config)

@@ -20,7 +20,7 @@ class CNN(Policy):
     defaults: dict[str, Any] = dict(window=8, hidden=128, layers=3, kernel=3)
 
     def __init__(self, config: dict[str, Any]):
-        super().__init__(self.defaults | config)
+        super().__init__(config)
         c = self.config
         if c["kernel"] % 2 != 1:
             raise PdkitError(f"The CNN's kernel must be odd, so that the window keeps its length, not {c['kernel']}.")

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 import torch
 import torch.nn.functional as F
+from torch import nn
 
 from ..errors import PdkitError, unknown
 from .base import Normalizer, Policy
@@ -37,12 +38,12 @@ class DiffusionPolicy(Policy):
 
     kind = "diffusion"
     defaults: dict[str, Any] = dict(window=2, horizon=16, chunk=4, dims=[64, 128, 256], kernel=5, groups=8, embed=64, diffusion_steps=100,
-                                    prediction="epsilon", sampler="ddim", sampler_steps=4, spacing="leading",
-                                    late_steps=0)
+                                    prediction="epsilon", sampler="ddim", sampler_steps=4, spacing="leading", late_steps=0)
+    least = dict(embed=4, late_steps=0)
     recipe: dict[str, Any] = dict(lr=1e-4, beta1=0.95, weight_decay=1e-6, schedule="cosine", lr_warmup=500, ema_power=0.75)
 
     def __init__(self, config: dict[str, Any]):
-        super().__init__(self.defaults | config)
+        super().__init__(config)
         c = self.config
         self.window, self.chunk, self.horizon = c["window"], c["chunk"], c["horizon"]
         shortest = 2 ** (len(c["dims"]) - 1)
@@ -52,6 +53,9 @@ class DiffusionPolicy(Policy):
         if not 1 <= self.chunk <= self.horizon - self.window + 1:
             raise PdkitError(f"Diffusion Policy's chunk ({self.chunk}) must be at least 1 and fit between the latest of {self.window} "
                              f"observations and the horizon ({self.horizon}).")
+        if c["kernel"] % 2 != 1 or c["embed"] % 2:
+            raise PdkitError(f"Diffusion Policy's kernel must be odd, so that its U-Net keeps the time's length, and embed even, for sines "
+                             f"and cosines, not {c['kernel']} and {c['embed']}.")
         if any(d % c["groups"] for d in c["dims"]):
             raise PdkitError(f"Diffusion Policy's dims {c['dims']} must be multiples of its groups ({c['groups']}).")
         if not 1 <= c["sampler_steps"] <= c["diffusion_steps"]:
@@ -62,8 +66,8 @@ class DiffusionPolicy(Policy):
         self.sampler = _scheduler(c["sampler"], c)
         self.sampler.set_timesteps(c["sampler_steps"] if c["sampler"] == "ddim" else c["diffusion_steps"])
         if not 0 <= c["late_steps"] <= self.sampling_steps:
-            raise PdkitError(f"The steps with a network of their own must be from 0 to all {self.sampling_steps} of the sampler's, not "
-                             f"{c['late_steps']}.")
+            raise PdkitError(f"late_steps, the steps with a network of their own, must be from 0 to all {self.sampling_steps} of the "
+                             f"sampler's, not {c['late_steps']}.")
         self.late = copy.deepcopy(self.unet) if c["late_steps"] else None
 
     @property
@@ -83,6 +87,11 @@ class DiffusionPolicy(Policy):
     def condition(self, windows: torch.Tensor) -> torch.Tensor:
         """What the U-Net sees of windows (N, window, obs_dim): (N, window * obs_dim)."""
         return self.normalizer(windows).flatten(1)
+
+    def film(self) -> nn.Linear:
+        """A copy of what turns an activated condition (N, window * obs_dim) into the scales and shifts of all blocks of the U-Net, as far
+        as they depend on the observations: what the diffusion step adds is the same for all."""
+        return self.unet.film(self.config["obs_dim"] * self.window)
 
     def loss(self, windows: torch.Tensor, actions: torch.Tensor) -> dict[str, torch.Tensor]:
         noise = torch.randn(actions.shape).to(actions.device)  # drawn on the CPU everywhere: one generator to restore

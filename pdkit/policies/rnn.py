@@ -19,7 +19,7 @@ class BCRNN(Policy):
     defaults: dict[str, Any] = dict(window=10, hidden=256, layers=2)
 
     def __init__(self, config: dict[str, Any]):
-        super().__init__(self.defaults | config)
+        super().__init__(config)
         c = self.config
         self.window = c["window"]
         self.normalizer = Normalizer(c["obs_dim"])

@@ -68,6 +68,14 @@ class UNet(nn.Module):
         self.grow = nn.ModuleList(nn.ConvTranspose1d(d, d, 4, stride=2, padding=1) for d in dims[-2::-1])
         self.out = nn.Sequential(Conv(dims[0], dims[0], kernel, groups), nn.Conv1d(dims[0], act_dim, 1))
 
+    def film(self, condition: int) -> nn.Linear:
+        """The FiLM layers of all blocks as one, (B, condition) -> (B, twice all channels), of an activated condition alone: every layer is
+        linear in step and condition side by side, so the step adds a constant, which is left out, as is the bias."""
+        weights = torch.cat([block.film.weight for block in self.modules() if isinstance(block, FiLMBlock)])[:, -condition:]
+        layer = nn.Linear(condition, len(weights), bias=False)
+        layer.weight.data.copy_(weights)
+        return layer
+
     def forward(self, actions: torch.Tensor, steps: torch.Tensor, condition: torch.Tensor) -> torch.Tensor:
         condition = torch.cat([self.step(step_embedding(steps, self.embed)), condition], dim=-1)
         x, kept = actions.transpose(1, 2), []

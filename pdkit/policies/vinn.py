@@ -2,10 +2,11 @@
 
     d_i = |phi(o) - phi(o_i)|,   a = sum_i softmax(-d)_i a_i   over the k nearest observations o_i of the demonstrations
 
-phi is either the normalised observation ("raw") or what the GPT of a trained Behavior Transformer makes of the window, at its last
-position; the FiLM features of Diffusion Policy are left out. k = 1 copies the nearest action, as FISH does. `exclusion` adds FISH's
-buffer against getting stuck: a neighbour that comes up for more than the `tolerance`-th time is passed over for the next nearest, and
-stays out until `exclusion` others have been put out after it (FISH: 3 and 1).
+phi is the normalised observation ("raw"); or what the GPT of a trained Behavior Transformer makes of the window, at its last position;
+or the scales and shifts by which the observations steer all blocks of a trained Diffusion Policy's U-Net (FiLM; the paper does not say
+which of them, ours are all: they are the same at each diffusion step up to a constant, which distances do not see). k = 1 copies the
+nearest action, as FISH does. `exclusion` adds FISH's buffer against getting stuck: a neighbour that comes up for more than the
+`tolerance`-th time is passed over for the next nearest, and stays out until `exclusion` others have been put out after it (FISH: 3 and 1).
 
 FISH carries that buffer from step to step. A policy here holds no state per episode, so the buffer is played through again from the
 last `history` observations; what was chosen before them is forgotten. How large k is in the paper is not known: 5 is ours.
@@ -16,51 +17,61 @@ from collections import Counter, deque
 from typing import Any
 
 import torch
+import torch.nn.functional as F
 from torch import nn
 
 from ..errors import PdkitError
 from .base import Normalizer, Policy, load_policy
 from .bet import BeT
+from .diffusion import DiffusionPolicy
+
+LENDERS: dict[str, type[Policy]] = {cls.kind: cls for cls in (BeT, DiffusionPolicy)}  # whose features can be used
 
 
 class VINN(Policy):
-    """Config: obs_dim, act_dim, k, exclusion (0: none), tolerance, history, representation ("raw", or the folder of a trained bet, which
-    is replaced by its configuration; its GPT is part of this policy's weights), rows (of the library; 0 before `remember`)."""
+    """Config: obs_dim, act_dim, k, exclusion (0: none), tolerance, history, representation ("raw", or the folder of a trained bet or
+    diffusion, which is replaced by its kind and configuration; its GPT, or FiLM layers, are part of this policy's weights), rows (of the
+    library; 0 before `remember`)."""
 
     kind = "vinn"
     learns = False
     defaults: dict[str, Any] = dict(k=5, exclusion=0, tolerance=1, history=20, representation="raw", rows=0)
+    least = dict(exclusion=0, rows=0)
 
     def __init__(self, config: dict[str, Any]):
-        super().__init__(self.defaults | config)
+        super().__init__(config | {"representation": "raw"})
         c = self.config
-        if c["k"] < 1 or c["exclusion"] < 0 or c["tolerance"] < 1 or c["history"] < 1:
-            raise PdkitError("VINN needs k, tolerance and history of at least 1 and exclusion of at least 0.")
         if c["exclusion"] and c["k"] != 1:
             raise PdkitError(f"VINN's exclusion buffer chooses one neighbour; set k=1 (now {c['k']}) or exclusion=0.")
-        trained = self._representation()
+        trained = self._representation(config.get("representation", "raw"))
         self.normalizer = Normalizer(c["obs_dim"])
-        self.gpt: nn.Module | None = trained.gpt if trained else None
+        self.gpt: nn.Module | None = trained.gpt if isinstance(trained, BeT) else None
+        self.film: nn.Linear | None = trained.film() if isinstance(trained, DiffusionPolicy) else None
         if trained:
             self.normalizer.load_state_dict(trained.normalizer.state_dict())
         self.looks = trained.window if trained else 1  # observations that make one feature
         self.window = self.looks + (c["history"] if c["exclusion"] else 0)
-        self.feature_dim = trained.config["features"] if trained else c["obs_dim"]
+        self.feature_dim = self.film.out_features if self.film else trained.config["features"] if trained else c["obs_dim"]
         self.register_buffer("library", torch.zeros(c["rows"], self.feature_dim))
         self.register_buffer("actions", torch.zeros(c["rows"], c["act_dim"]))
         self.requires_grad_(False).eval()
 
-    def _representation(self) -> BeT | None:
-        """The Behavior Transformer whose features are used: new from its configuration (weights follow), or read from its folder."""
-        given = self.config["representation"]
+    def _representation(self, given: Any) -> Policy | None:
+        """The policy whose features are used: new from its kind and configuration (weights follow), or read from its folder."""
+        kinds = " or ".join(LENDERS)
         if given == "raw":
             return None
-        trained = BeT(given) if isinstance(given, dict) else load_policy(given)
-        if type(trained) is not BeT:
-            raise PdkitError(f"VINN takes the features of a policy of kind bet, not {trained.kind}; train one with `pdkit train base`.")
+        if isinstance(given, dict) and given.get("kind") in LENDERS:
+            trained = LENDERS[given["kind"]]({name: value for name, value in given.items() if name != "kind"})
+        elif isinstance(given, str):
+            trained = load_policy(given)
+        else:
+            raise PdkitError(f"VINN's representation is raw, or the folder of a trained policy of kind {kinds}, not {given!r}.")
+        if type(trained) not in LENDERS.values():
+            raise PdkitError(f"VINN takes the features of a policy of kind {kinds}, not {trained.kind}; train one with `pdkit train base`.")
         if (trained.config["obs_dim"], trained.config["act_dim"]) != (self.config["obs_dim"], self.config["act_dim"]):
             raise PdkitError("VINN's representation was trained for other observations or actions; give one of the same task.")
-        self.config["representation"] = trained.config
+        self.config["representation"] = {"kind": trained.kind} | trained.config
         return trained
 
     def train(self, mode: bool = True) -> VINN:
@@ -69,7 +80,7 @@ class VINN(Policy):
 
     def fit_statistics(self, observations, actions, seed: int = 0) -> None:
         """Normaliser from observations (N, obs_dim); a trained representation keeps its own."""
-        if self.gpt is None:
+        if self.config["representation"] == "raw":
             self.normalizer.fit(observations)
 
     @torch.no_grad()
@@ -84,6 +95,8 @@ class VINN(Policy):
     def features(self, windows: torch.Tensor) -> torch.Tensor:
         """phi (N, feature_dim) of windows (N, at least `looks`, obs_dim)."""
         seen = self.normalizer(windows[:, -self.looks:])
+        if self.film is not None:
+            return self.film(F.mish(seen.flatten(1))).float()
         return seen[:, -1] if self.gpt is None else self.gpt(seen)[:, -1].float()
 
     def _nearest(self, features: torch.Tensor, k: int) -> tuple[torch.Tensor, torch.Tensor]:

@@ -13,10 +13,11 @@ class Zero(Policy):
     """Config: obs_dim, act_dim, window, chunk. It carries a normaliser, so that networks beside it see observations as usual."""
 
     kind = "zero"
+    learns = False
     defaults: dict[str, Any] = dict(window=1, chunk=1)
 
     def __init__(self, config: dict[str, Any]):
-        super().__init__(self.defaults | config)
+        super().__init__(config)
         self.window, self.chunk = self.config["window"], self.config["chunk"]
         self.normalizer = Normalizer(self.config["obs_dim"])
 
@@ -30,6 +31,9 @@ class Zero(Policy):
     def fit_statistics(self, observations: np.ndarray, actions: np.ndarray, seed: int = 0) -> None:
         """Normaliser from observations (N, obs_dim)."""
         self.normalizer.fit(observations)
+
+    def remember(self, windows: torch.Tensor, actions: torch.Tensor) -> None:
+        """Nothing."""
 
     def forward(self, windows: torch.Tensor) -> torch.Tensor:
         return torch.zeros(len(windows), self.chunk, self.config["act_dim"], device=windows.device)

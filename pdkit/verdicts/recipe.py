@@ -1,5 +1,7 @@
-"""The decorator's parts (data/sweeps/ablations.toml, low_checkpoint.toml)."""
+"""The decorator's parts, and other policies below it (data/sweeps/ablations.toml, base_policies.toml, low_checkpoint.toml)."""
 from __future__ import annotations
+
+from functools import partial
 
 from ..ablations import GRID, action_scales, alpha_works
 from ..claims import Finding, by_seed, compared, difference, finding, jointly, judged, percent, points, recorded, weakest
@@ -59,6 +61,18 @@ def _() -> Finding:
                      for name, (scale, verdict, behind, near) in found.items())
     values = by_seed(table, next(near for *_, near in found.values()), "decorated_success")
     return finding("ablations", values, told, f"the lower one: {points(interval)}", jointly(*known))
+
+
+# ---- other base policies ---------------------------------------------------------------------------------------------
+
+def _improves(recipe: str) -> Finding:
+    """Significantly: by more than 20 points (ours, as for a low-performing checkpoint). The paper's task is TurnFaucet."""
+    return compared("base_policies", recipe, second_column="base_success", enough=0.2, paper=("TurnFaucet",))
+
+
+measures("Policy Decorator significantly improves an MLP")(partial(_improves, "mlp"))
+measures("Policy Decorator significantly improves a BC-RNN")(partial(_improves, "rnn"))
+measures("Policy Decorator significantly improves a CNN")(partial(_improves, "cnn"))
 
 
 @measures("Policy Decorator substantially improves a low-performing BeT")

@@ -1,0 +1,44 @@
+"""All tasks in one table and one figure, beside the paper's averages."""
+import numpy as np
+import pandas as pd
+import pytest
+
+from pdkit import plots_range, task_range
+from pdkit.stats import wilson
+
+
+@pytest.fixture
+def tasks():
+    rows = [dict(task="Door", policy="bet", seed=seed, episodes=200, env_steps=1000 + seed, base_success=0.5, decorated_success=end,
+                 decorated_success_at_end=end - 0.1) for seed, end in enumerate((0.9, 0.95, 1.0))]
+    rows.append(dict(task="StackCube", policy="mlp", seed=0, episodes=100, env_steps=60, base_success=0.4, decorated_success=0.8,
+                     decorated_success_at_end=0.3))
+    return task_range.by_task(pd.DataFrame(rows))
+
+
+def test_every_task_of_the_paper_has_a_row(tasks):
+    assert list(tasks.suite) == ["maniskill"] * 4 + ["adroit"] * 4 and tasks.task.nunique() == 8
+    known = tasks.set_index("task")
+    assert known.loc["Door", "decorated"] == pytest.approx(0.95) and known.loc["Door", "env_steps"] == 1002
+    half = 4.302653 * 0.05 / np.sqrt(3)  # Student's t over three seeds
+    assert known.loc["Door", "low"] == pytest.approx(0.95 - half, abs=1e-6) and known.loc["Door", "high"] == 1.0
+    one = wilson(80, 100)
+    assert (known.loc["StackCube", "low"], known.loc["StackCube", "high"]) == (one.low, one.high)  # one seed: its test episodes' alone
+    assert known.loc["Pen", "seeds"] == 0 and np.isnan(known.loc["Pen", "decorated"]) and known.loc["Pen", "demos"] == 25
+    assert known.loc["TurnFaucet", "label"] == "scripted, other objects" and known.loc["Pen", "label"] == "agent"
+
+
+def test_averages_are_over_what_is_recorded(tasks):
+    means = task_range.averages(tasks).set_index("over")
+    assert means.loc["all", "tasks"] == "2 of 8" and means.loc["all", "decorated"] == pytest.approx(0.875)
+    assert means.loc["maniskill", "base"] == pytest.approx(0.4) and means.loc["maniskill", "paper_base"] == 0.3625
+    assert means.loc["adroit", "tasks"] == "1 of 4" and means.loc["adroit", "paper_decorated"] == 0.99575
+
+
+def test_the_figure_names_what_is_not_recorded(tasks):
+    (ax,) = plots_range.range_figure(tasks, task_range.averages(tasks)).axes
+    labels = [label.get_text() for label in ax.get_yticklabels()]
+    assert labels[0] == "StackCube (1 seed)" and labels[1] == "PegInsertionSide (not recorded)" and labels[4] == "mean, 1 of 4 tasks"
+    assert labels[5] == "Door (3 seeds)" and len(labels) == 10
+    squares = [line for line in ax.lines if line.get_marker() == "s"]
+    assert [float(np.ravel(line.get_xdata())[0]) for line in squares] == pytest.approx([0.3625, 0.98325, 0.4675, 0.99575])
