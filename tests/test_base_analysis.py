@@ -110,7 +110,7 @@ def test_the_selected_checkpoint_is_the_one_that_is_tested(monkeypatch):
         kept[len(kept)] = {k: v.clone() for k, v in policy.state_dict().items()}
         return {"success_once": next(scores), "success_at_end": 0.0}
 
-    monkeypatch.setattr(imitate, "scores", told)
+    monkeypatch.setattr(imitate, "selection_scores", told)
     curve, chosen = analysis.learned(SMALL["MLP"], demos, spec, replace(config, bf16=False), tested)
     assert curve.step.tolist() == [20, 40, 60] and curve.success.tolist() == [0.25, 0.75, 0.5]
     policy = analysis.fresh(SMALL["MLP"], demos, spec)
