@@ -372,7 +372,7 @@ def test_fish_over_gpt_features_sees_the_windows_of_the_policy(beside):
     from pdkit.policies import BeT
 
     bet = clone(BeT, beside, TINY, iterations=5)
-    base = VINN({"obs_dim": 4, "act_dim": 2, "k": 1, "representation": bet.config})
+    base = VINN({"obs_dim": 4, "act_dim": 2, "k": 1, "representation": {"kind": "bet"} | bet.config})
     base.gpt.load_state_dict(bet.gpt.state_dict())
     windows, actions = Windows(beside.first(2), 3, True).all()
     base.remember(windows, actions)
