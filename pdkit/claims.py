@@ -32,6 +32,7 @@ DECORATOR = "policy_decorator"
 FINE_TUNING = ("sac_finetune", "sac_finetune,actor_lr=1e-4", "rlpd_paper", "rot", "calql")  # the policy's own weights move
 OTHERS = ("residual_rl", "jsrl", "fish")  # baselines that leave it as it is
 VERDICTS = ("not", "partly", "reproduced")  # from the weakest
+NEARLY = 0.95  # success that counts as nearly all (ours; the paper's averages are 98 % and more)
 FLOOR = 0.05  # success below which two sides are not told apart
 TASKS = {"adroit": ("Door", "Pen", "Hammer", "Relocate"), "maniskill": ("StackCube", "PegInsertionSide", "TurnFaucet", "PushChair")}
 

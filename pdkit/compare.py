@@ -201,13 +201,13 @@ def own_run(method: str, task: str, profile: str, seed: int, folder: Path, episo
     config = method_config(method, task, profile, seed, policy=policy, **changes)
     needed = config.demo_fraction or trainer_of(method).needs_demos
     demos = sources.bundled(task).first(card["info"]["demos"]) if needed else None
-    settings = flat(config) | origin(card, demos)
+    encoder = encoder_of(start)
+    settings = flat(config) | origin(card, demos, encoder)
     mark = hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:8]
     run = Run(folder / f"{method}-seed{seed}-{mark}", "decorated", settings)
     if not run.finished or run.manifest["results"]["episodes"] != episodes:
-        encoder = encoder_of(start)
         seen = encoded(demos, pictures_of(demos), encoder) if encoder and demos else demos
-        decorate(config, policy, seen, run.folder, episodes, origin(card, demos), encoder=encoder)
+        decorate(config, policy, seen, run.folder, episodes, origin(card, demos, encoder), encoder=encoder)
         run = Run(run.folder, "decorated", settings)
     labels = {"task": task, "recipe": recipe or method, "seed": seed}
     return pd.DataFrame([run.manifest["results"] | labels]), pd.read_csv(run.folder / "metrics.csv").assign(**labels)

@@ -11,7 +11,7 @@ import pandas as pd
 from scipy import spatial
 from scipy import stats as scipy_stats
 
-from .claims import FLOOR
+from .claims import FLOOR, jointly, judged
 from .decorated import Decorated
 from .demos import Demos
 from .errors import PdkitError
@@ -144,19 +144,20 @@ def verdict(episodes: pd.DataFrame, base: str, decorated: str) -> tuple[str, lis
 
     Two statements: the base policy does worse on novel objects than on source ones, clearly where the two Wilson intervals do not
     overlap; on novel objects the decorated policy does better than the base policy, clearly where the paired interval lies above 0.
-    Both clearly: reproduced. Neither even points that way: not. Else partly. Where nothing reaches FLOOR, it is no test.
+    A statement that is clear counts as reproduced, one that does not even point that way as not, and both together by
+    `claims.jointly`. Where nothing reaches FLOOR, it is no test.
     """
     def part(policy: str, kind: str) -> pd.DataFrame:
         return episodes[(episodes.policy == policy) & (episodes.objects == kind)]
 
     source, novel = (wilson(int(rows.success_once.sum()), len(rows)) for rows in (part(base, "source"), part(base, "novel")))
     gain = paired(part(base, "novel"), part(decorated, "novel"))
-    held = (novel.value < source.value, gain.difference > 0)
-    clear = (novel.high < source.low, gain.low > 0)
+    apart = novel.high < source.low
+    gap = "reproduced" if apart else "partly" if novel.value < source.value else "not"
     reasons = [f"{base}, novel against source objects: {100 * (novel.value - source.value):+.0f} points, "
-               f"intervals {'apart' if clear[0] else 'overlap'}",
+               f"intervals {'apart' if apart else 'overlap'}",
                f"novel objects, {decorated} against {base}: {100 * gain.difference:+.0f} points "
                f"({100 * gain.low:+.0f} to {100 * gain.high:+.0f})"]
     if max(source.value, novel.value, gain.other.value) < FLOOR:
         return "untested", ["hardly any episode was solved"]
-    return "reproduced" if all(clear) else "partly" if any(held) else "not", reasons
+    return jointly(gap, judged(Interval(gain.difference, gain.low, gain.high))), reasons

@@ -47,9 +47,11 @@ def describe_machine() -> dict[str, Any]:
             "torch_threads": torch.get_num_threads(), "cuda": torch.cuda.is_available(), "versions": versions, "git": _git()}
 
 
-def origin(base_card: dict[str, Any], demos: Any | None) -> dict[str, Any]:
-    """What a run starts from, for its manifest: checksums of the base policy (of its card) and of the demonstrations, how many."""
-    return {"base": base_card["weights_sha256"], "demos": demos.checksum if demos else None, "num_demos": demos.num if demos else 0}
+def origin(base_card: dict[str, Any], demos: Any | None, encoder: Any | None = None) -> dict[str, Any]:
+    """What a run starts from, for its manifest: checksums of the base policy (of its card), of the demonstrations, how many, and of the
+    encoder where there is one."""
+    found = {"base": base_card["weights_sha256"], "demos": demos.checksum if demos else None, "num_demos": demos.num if demos else 0}
+    return found | ({"encoder": encoder.checksum} if encoder else {})
 
 
 class Run:

@@ -17,6 +17,7 @@ import pandas as pd
 from .cli import Parser
 from .decorated import Decorated
 from .demos import Demos, sources
+from .demos.cli import Progress
 from .errors import PdkitError, unknown
 from .evaluate import evaluate
 from .files import DATA, atomic_file, runs_root
@@ -27,7 +28,7 @@ from .methods.registry import make_trainer, method_config, trainer_of
 from .online import Trainer
 from .online_config import OnlineConfig
 from .pixels.encoders import Encoder, save_encoder
-from .pixels.learn import imitate_pixels
+from .pixels.learn import check_pixels, imitate_pixels
 from .pixels.pictures import encoded, pictures_of
 from .pixels.task import ENCODER, encoder_of, pixel_spec, save_visual
 from .policies import POLICIES, Policy, load_policy, save_policy
@@ -99,6 +100,8 @@ def _base(args) -> int:
         raise unknown("policy", args.policy, POLICIES)
     demos, settings = base_demos(args), parse_settings(args.set)
     shift = settings.pop("random_shift", None) if args.pixels else None
+    if args.pixels:
+        check_pixels(args.policy, shift)
     fields = {f.name for f in dataclasses.fields(ImitateConfig)}
     architecture = {k: v for k, v in settings.items() if k in POLICIES[args.policy].defaults}
     for name in settings:
@@ -112,7 +115,8 @@ def _base(args) -> int:
         print("  " + ", ".join(f"{k} {v:.3g}" for k, v in row.items()), flush=True)
 
     if args.pixels:
-        policy, encoder, history = imitate_pixels(args.policy, demos, pictures_of(demos), config, architecture, shift=shift, progress=show)
+        pictures = pictures_of(demos, Progress(demos.num, "drawn"))
+        policy, encoder, history = imitate_pixels(args.policy, demos, pictures, config, architecture, shift=shift, progress=show)
     else:
         policy, history = imitate(args.policy, demos, config, architecture, progress=show)
     best = max(history, key=lambda row: row.get("success_once", row["iteration"]))
@@ -132,6 +136,8 @@ def _decorated(args) -> int:
     visual = DATA / "checkpoints" / args.task / "pixels" / "base"
     base_folder = Path(args.base) if args.base else visual if args.pixels else shipped_base(args.method, args.task)
     encoder = encoder_of(base_folder)
+    if encoder:
+        pixel_spec(get_task(args.task), encoder)  # refuses another task's before any picture is drawn
     if args.pixels and not encoder:
         raise PdkitError(f"There is no visual policy in {base_folder}; train one with `pdkit train base {args.task} --policy mlp --pixels` "
                          "and name its folder with --base.")
@@ -146,9 +152,9 @@ def _decorated(args) -> int:
         print(f"{args.task}, seed {seed}: " + str(differences(config, args.profile) or "the profile unchanged"), flush=True)
         out = Path(args.out or runs_root() / "train") / f"{args.task}-{args.recipe}-seed{seed}"
         demos = base_demos(args) if config.demo_fraction or trainer_of(args.method).needs_demos else None
-        started_from = origin(read_card(base_folder), demos)
+        started_from = origin(read_card(base_folder), demos, encoder)
         if encoder and demos:
-            demos = encoded(demos, pictures_of(demos), encoder)
+            demos = encoded(demos, pictures_of(demos, Progress(demos.num, "drawn")), encoder)
         row = decorate(config, base, demos, out, args.episodes, started_from, args.tensorboard, encoder)
         row |= {"recipe": args.recipe, "command": command_of(args, seed)}
         print(", ".join(f"{k} {v}" for k, v in row.items()), flush=True)
@@ -202,7 +208,7 @@ def decorate(config, base: Policy, demos: Demos | None, out: Path, episodes: int
     trainer.save_policy(policy, out / "decorated")
     if encoder:
         save_encoder(encoder, out / "decorated" / "base" / ENCODER)
-    tables = {"base": _base_episodes(base, trainer.spec, episodes, config, started_from["base"]),
+    tables = {"base": _base_episodes(base, trainer.spec, episodes, config, started_from),
               "decorated": _episodes(policy, trainer.spec, episodes)}
     for name, table in tables.items():
         with atomic_file(out / f"{name}_episodes.csv") as temporary:
@@ -223,9 +229,11 @@ def _episodes(actor: Policy | Decorated, spec: TaskSpec, episodes: int) -> pd.Da
                     num_envs=50)
 
 
-def _base_episodes(base: Policy, spec: TaskSpec, episodes: int, config: OnlineConfig, weights: str) -> pd.DataFrame:
+def _base_episodes(base: Policy, spec: TaskSpec, episodes: int, config: OnlineConfig, started_from: dict[str, Any]
+                   ) -> pd.DataFrame:
     """The base policy's test episodes: the same for every method and seed that starts from it, so they are run once and kept."""
-    what = json.dumps([spec.name, config.start_fraction, episodes, weights, base.kind, base.config, describe_machine()["versions"]])
+    weights = [started_from[name] for name in ("base", "encoder") if name in started_from]
+    what = json.dumps([spec.name, config.start_fraction, episodes, *weights, base.kind, base.config, describe_machine()["versions"]])
     kept = runs_root() / "base_episodes" / f"{spec.name}-{hashlib.sha256(what.encode()).hexdigest()[:16]}.csv"
     if not kept.exists():
         table = _episodes(base, spec, episodes)

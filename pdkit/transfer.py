@@ -44,11 +44,11 @@ def transfer(policy: Policy | Decorated, tasks: Sequence[str], episodes: int, en
             raise PdkitError(f"This policy takes {config['obs_dim']} numbers and gives {config['act_dim']}; {spec.name} gives "
                              f"{spec.obs_dim} and takes {spec.act_dim}: choose a task with the policy's own robot and observations.")
     rows = []
-    for spec in specs:
+    for task, spec in zip(tasks, specs, strict=True):
         policy.reset(0)
         table = evaluate(spec, policy.act, reported_seeds(episodes), window=policy.window, chunk=policy.chunk, num_envs=25, **options)
         rate = wilson(int(table.success_once.sum()), episodes)
-        rows.append(dict(task=spec.name, episodes=episodes, success=rate.value, low=rate.low, high=rate.high,
+        rows.append(dict(task=task, episodes=episodes, success=rate.value, low=rate.low, high=rate.high,
                          success_at_end=float(table.success_at_end.mean())))
     return pd.DataFrame(rows)
 

@@ -133,6 +133,8 @@ def test_verdict_follows_its_rule():
     assert analysis.verdict(episodes(many, few, few), "base", "decorated")[0] == "partly"  # a gap, and no gain
     assert analysis.verdict(episodes(half, half, many), "base", "decorated")[0] == "partly"  # a gain, and no gap
     assert analysis.verdict(episodes(few, many, many), "base", "decorated")[0] == "not"
+    slight = [1] * 7 + [0] * 33  # a gap that chance explains, and a loss
+    assert analysis.verdict(episodes(few, slight, [0] * 36 + [1] * 4), "base", "decorated")[0] == "not"
     assert analysis.verdict(episodes(none, none, none), "base", "decorated")[0] == "untested"
     _, reasons = analysis.verdict(episodes(many, few, many), "base", "decorated")
     assert "-70 points, intervals apart" in reasons[0] and "+70 points" in reasons[1]

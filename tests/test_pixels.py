@@ -1,4 +1,5 @@
 """Visual observations: cameras, encoders, pictures along demonstrations, imitation from them, and the derived task online."""
+import copy
 import dataclasses
 import json
 import pickle
@@ -10,9 +11,10 @@ import pytest
 import torch
 from worlds import reach_demos
 
-from pdkit import check, cli, pixel_analysis, plots_pixels
+from pdkit import check, cli, pixel_analysis, plots_pixels, train
 from pdkit.demos import Demos, sources
 from pdkit.errors import PdkitError
+from pdkit.files import DATA
 from pdkit.imitate import ImitateConfig
 from pdkit.online import Trainer
 from pdkit.pixels import pictures as kept
@@ -26,7 +28,7 @@ from pdkit.pixels.task import encoder_of, pixel_spec, save_visual
 from pdkit.policies import MLP, BeT, load_policy
 from pdkit.probes import PROBES
 from pdkit.profiles import online_config
-from pdkit.runs import Run
+from pdkit.runs import Run, origin
 from pdkit.tasks import get_task
 from pdkit.tasks.vector import VectorEnv
 from pdkit.video import try_render
@@ -470,3 +472,25 @@ def test_figures_of_views_and_shifts():
     curves = pd.DataFrame({"recipe": "a", "step": [10, 20], "train_success": [0.5, np.nan], "success_once": [np.nan, 1.0]})
     figure = plots_pixels.training_figure(curves, {"a": "A", "b": "none"}, base=0.4)
     assert figure.png() and list(figure.axes[0].lines[0].get_xdata()) == [10]
+
+
+# ---- what is refused before anything is drawn -----------------------------------------------------------------------
+
+@pytest.mark.parametrize(("words", "message"), [
+    (["base", "Door", "--policy", "diffusion", "--pixels"], "kinds mlp and bet"),
+    (["base", "Door", "--policy", "mlp", "--pixels", "--set", "random_shift=-1"], "whole number"),
+    (["base", "Door", "--policy", "mlp", "--pixels", "--set", "random_shift=0.5"], "whole number"),
+    (["decorated", "Pen", "--pixels", "--base", str(DATA / "checkpoints" / "Door" / "pixels" / "base")], "robot of Door, not of Pen")])
+def test_a_bad_command_draws_nothing(monkeypatch, words, message):
+    monkeypatch.setattr(train, "pictures_of", lambda *given: pytest.fail("pictures were drawn"))
+    with pytest.raises(PdkitError, match=message):
+        train.main(words)
+
+
+def test_the_encoder_is_part_of_what_a_run_starts_from():
+    encoder = load_encoder(DATA / "checkpoints" / "Door" / "pixels" / "base" / "encoder")
+    card = {"weights_sha256": "x"}
+    assert "encoder" not in origin(card, None)
+    other = copy.deepcopy(encoder)
+    next(other.parameters()).data += 1
+    assert origin(card, None, encoder) != origin(card, None, other) and origin(card, None, encoder)["encoder"] == encoder.checksum

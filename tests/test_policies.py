@@ -207,6 +207,8 @@ def test_a_copy_can_use_the_weights_beside_it(tmp_path):
     copy = tmp_path / "decorated" / "base"
     with pytest.raises(PdkitError, match="only a copy"):
         share_weights(copy, tmp_path / "another")
+    with pytest.raises(PdkitError, match="only a copy"):
+        share_weights(copy, copy)
     share_weights(copy, tmp_path / "base")
     x = np.random.default_rng(1).normal(size=(2, 4, 3)).astype(np.float32)
     assert not (copy / "weights.safetensors").exists() and np.array_equal(load_policy(copy).act(x), policy.act(x))

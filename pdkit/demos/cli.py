@@ -63,7 +63,7 @@ def _draw(args) -> int:
     if not (args.show or args.task):
         raise PdkitError("Name a task whose demonstrations are to be drawn, or a file of them with --show.")
     demos = load_demos(Path(args.show)) if args.show else sources.bundled(args.task)
-    pictures = pictures_of(demos, Progress(demos.num))
+    pictures = pictures_of(demos, Progress(demos.num, "drawn"))
     cameras, height, width = len(pictures.rgb[0]) // 3, *pictures.rgb.shape[2:]
     print(f"{picture_file(demos)}: {len(pictures.rgb)} frames of {cameras} camera(s), {height} x {width}"
           f"{', with distances' if pictures.depth.size else ''}; {demos.num} demonstrations replayed as recorded")
@@ -87,15 +87,15 @@ def _make(args, source: str) -> Demos:
 
 
 class Progress:
-    """`kept of num, tried, time left` on one line of a terminal (every tenth part elsewhere)."""
+    """How many of `num`, what was done with them, and the time left, on one line of a terminal (every tenth part elsewhere)."""
 
-    def __init__(self, num: int):
-        self.num, self.started, self.shown = num, time.monotonic(), -1
+    def __init__(self, num: int, done: str = "kept of {tried} tried"):
+        self.num, self.done, self.started, self.shown = num, done, time.monotonic(), -1
 
     def __call__(self, kept: int, tried: int) -> None:
         passed = time.monotonic() - self.started
         left = passed / max(kept, 1) * (self.num - kept)
-        line = f"{kept}/{self.num} kept of {tried} tried, about {left:.0f} s left"
+        line = f"{kept}/{self.num} {self.done.format(tried=tried)}, about {left:.0f} s left"
         if sys.stderr.isatty():
             print(f"\r{line}   ", end="\n" if kept >= self.num else "", file=sys.stderr, flush=True)
         elif kept * 10 // self.num > self.shown:

@@ -9,6 +9,7 @@ Colours come in as bytes, distances in 1/1024 metre; the network sees both divid
 """
 from __future__ import annotations
 
+import hashlib
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -54,6 +55,11 @@ class Encoder(nn.Module):
         super().__init__()
         self.view = view
         self.net = PlainConv(view.channels, view.height, view.width)
+
+    @property
+    def checksum(self) -> str:
+        """Of its weights."""
+        return hashlib.sha256(b"".join(p.detach().numpy().tobytes() for p in self.parameters())).hexdigest()
 
     def forward(self, rgb: torch.Tensor, depth: torch.Tensor) -> torch.Tensor:
         """Features (B, 256) of colours (B, 3 k, height, width), bytes, and distances (B, k, height, width) in 1/1024 metre, or

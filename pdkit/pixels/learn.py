@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import torch
@@ -38,8 +39,9 @@ def imitate_pixels(kind: str, demos: Demos, pictures: Pictures, config: ImitateC
     Returns the selected policy and encoder, in evaluation mode and with weights rounded to bfloat16 (as they are shipped), and one row
     a checkpoint as `imitate` does. Raises PdkitError for a kind of policy that is not one of HEADS, or a loss that is no number.
     """
-    if kind not in HEADS:
-        raise PdkitError(f"Policies that see pictures are of the kinds {' and '.join(HEADS)}, not {kind}.")
+    check_pixels(kind, shift)
+    if config.ema_power:
+        raise PdkitError("Policies that see pictures are trained without averaged weights; leave ema_power at 0.")
     view, spec = view or view_of(demos.task), spec or get_task(demos.task)
     shift = view.shift if shift is None else shift
     torch.manual_seed(config.seed)
@@ -52,7 +54,8 @@ def imitate_pixels(kind: str, demos: Demos, pictures: Pictures, config: ImitateC
     policy.train()
     # A window of observations is told by the number of each frame, and the robot's state then.
     numbered = np.concatenate([np.arange(len(state), dtype=np.float32)[:, None], state], axis=1)
-    windows = Windows(dataclasses.replace(demos, observations=numbered), policy.window, config.pad_start, policy.horizon, spec.resting)
+    windows = Windows(dataclasses.replace(demos, observations=numbered), policy.window, config.pad_start, policy.horizon, spec.resting,
+                      config.hold_end)
     rgb, depth = torch.from_numpy(pictures.rgb), torch.from_numpy(pictures.depth.astype(np.int32))
     groups = [*policy.parameter_groups(config.weight_decay), {"params": list(encoder.parameters()), "weight_decay": config.weight_decay}]
     optimizer = torch.optim.AdamW(groups, lr=config.lr, betas=(config.beta1, 0.999), fused=True)
@@ -85,6 +88,14 @@ def imitate_pixels(kind: str, demos: Demos, pictures: Pictures, config: ImitateC
         if progress:
             progress(row)
     return *chosen, history
+
+
+def check_pixels(kind: str, shift: Any) -> None:
+    """Raises PdkitError for a kind of policy that is not one of HEADS, or a shift (None: the view's) that is no whole number from 0 on."""
+    if kind not in HEADS:
+        raise PdkitError(f"Policies that see pictures are of the kinds {' and '.join(HEADS)}, not {kind}.")
+    if shift is not None and (type(shift) is not int or shift < 0):
+        raise PdkitError(f"random_shift counts pixels: it must be a whole number from 0 on, not {shift!r}.")
 
 
 def _finished(policy: Policy, encoder: Encoder, demos: Demos, pictures: Pictures) -> tuple[Policy, Encoder]:

@@ -18,8 +18,10 @@ from typing import Any
 import numpy as np
 import torch
 
+from ..errors import PdkitError
 from ..policies import Policy, save_policy
 from ..tasks.spec import TaskSpec
+from .cameras import VIEWS
 from .encoders import FEATURES, Encoder, load_encoder, save_encoder
 from .sim import Frame, PixelSim, panels
 
@@ -67,7 +69,10 @@ def one_thread() -> Iterator[None]:
 
 
 def pixel_spec(spec: TaskSpec, encoder: Encoder) -> TaskSpec:
-    """`spec` seen through `encoder`."""
+    """`spec` seen through `encoder`. Raises PdkitError for an encoder of another view than the task's (worlds outside VIEWS have any)."""
+    if spec.name in VIEWS and replace(encoder.view, task=spec.name) != VIEWS[spec.name]:
+        raise PdkitError(f"This encoder was trained for the cameras and the robot of {encoder.view.task}, not of {spec.name}; give a "
+                         "policy that was trained on the same task.")
     return replace(spec, name=f"{spec.name}-pixels", obs_dim=encoder.view.state_dim + FEATURES,
                    make=functools.partial(FeatureSim, spec, encoder))
 

@@ -123,7 +123,8 @@ def share_weights(folder: str | Path, other: str | Path) -> None:
     """
     folder, other = Path(folder), Path(other)
     card, theirs = read_card(folder), read_card(other)
-    if card["weights_sha256"] != theirs["weights_sha256"] or sha256(other / WEIGHTS) != card["weights_sha256"]:
+    same = card["weights_sha256"] == theirs["weights_sha256"] and (other / WEIGHTS).exists()
+    if folder.resolve() == other.resolve() or not same or sha256(other / WEIGHTS) != card["weights_sha256"]:
         raise PdkitError(f"{other} does not hold the weights of {folder}; only a copy can be replaced.")
     write_json(folder / "policy.json", card | {"weights_in": os.path.relpath(other, folder)})
     (folder / WEIGHTS).unlink(missing_ok=True)
