@@ -14,7 +14,7 @@ Every verdict follows one of few rules, so that no one is tempted to choose the 
 """
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -186,6 +186,20 @@ def compared(record: str, first: str, second: str = "", *, column: str = "decora
     mine, theirs = (percent(series.loc[values.index].mean()) for series in (one, two))
     return finding(record, values, f"{a} {mine}, {b} {theirs}: {100 * interval.value:+.1f} points", points(interval),
                    judged(interval if sign > 0 else turned(interval), enough), paper)
+
+
+def ahead(record: str, table: pd.DataFrame, own: str, kinds: Mapping[str, Sequence[str]], paper: Sequence[str], beside: str = ""
+          ) -> Finding:
+    """A finding of the kind "`own` beats the best recipe of every kind": the interval is that of the smallest lead, the verdict that of the
+    weakest. `beside` is told behind what was measured."""
+    mine, leads = by_seed(table, own, "decorated_success"), []
+    for kind, recipes in kinds.items():
+        rival = best(table, recipes)
+        interval, values = difference(mine, by_seed(table, rival, "decorated_success"))
+        leads.append((interval, values, f"{100 * interval.value:+.1f} points against {rival} (best of {kind})"))
+    interval, values, _ = min(leads, key=lambda lead: lead[0].value)
+    return finding(record, values, f"{percent(mine.mean())}: " + ", ".join(lead[2] for lead in leads) + beside, points(interval),
+                   weakest(*(judged(lead[0]) for lead in leads)), paper)
 
 
 def finding(record: str, values: pd.Series, measured: str, interval: str, verdict: str, paper: Sequence[str] = ()) -> Finding:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import contextlib
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -122,20 +123,35 @@ class Average:
             self._ema.restore(self._parameters)
 
 
-def make_optimizer(policy: Policy, config: ImitateConfig) -> torch.optim.AdamW:
-    """AdamW over the policy's parameter groups, as one kernel for all of them."""
-    return torch.optim.AdamW(policy.parameter_groups(config.weight_decay), lr=config.lr, betas=(config.beta1, 0.999), fused=True)
+def make_optimizer(policy: Policy, config: ImitateConfig, others: Sequence[dict[str, Any]] = ()) -> torch.optim.AdamW:
+    """AdamW over the policy's parameter groups and `others`, as one kernel for all of them."""
+    groups = [*policy.parameter_groups(config.weight_decay), *others]
+    return torch.optim.AdamW(groups, lr=config.lr, betas=(config.beta1, 0.999), fused=True)
+
+
+def minimise(loss: Callable[[], dict[str, torch.Tensor]], optimizer: torch.optim.Optimizer, device: str, bf16: bool
+             ) -> dict[str, torch.Tensor]:
+    """One step down the `loss` among the terms that a call gives; the terms."""
+    with autocast(device, bf16):
+        terms = loss()
+    optimizer.zero_grad(set_to_none=True)
+    terms["loss"].backward()
+    optimizer.step()
+    return terms
 
 
 def gradient_step(policy: Policy, optimizer: torch.optim.Optimizer, observations: torch.Tensor, actions: torch.Tensor, bf16: bool
                   ) -> dict[str, torch.Tensor]:
     """One step on windows (B, window, obs_dim) and actions (B, horizon or window, act_dim); the loss terms."""
-    with autocast(observations.device.type, bf16):
-        terms = policy.loss(observations, actions)
-    optimizer.zero_grad(set_to_none=True)
-    terms["loss"].backward()
-    optimizer.step()
-    return terms
+    return minimise(lambda: policy.loss(observations, actions), optimizer, observations.device.type, bf16)
+
+
+def checkpoint_row(iteration: int, started: float, terms: dict[str, torch.Tensor], lr: float) -> dict[str, float]:
+    """iteration, seconds since `started` and the loss terms. Raises PdkitError for a loss that is no number."""
+    row = {"iteration": iteration, "seconds": time.monotonic() - started, **{k: float(v.detach()) for k, v in terms.items()}}
+    if not np.isfinite(row["loss"]):
+        raise PdkitError(f"The imitation loss became {row['loss']} at iteration {iteration}; lower lr (now {lr}).")
+    return row
 
 
 def imitate(kind: str, demos: Demos, config: ImitateConfig | None = None, policy_config: dict | None = None, *, device: str = "cpu",
@@ -172,9 +188,7 @@ def imitate(kind: str, demos: Demos, config: ImitateConfig | None = None, policy
             average.step()
         if iteration % config.eval_every and iteration < config.iterations:
             continue
-        row = {"iteration": iteration, "seconds": time.monotonic() - started, **{k: float(v.detach()) for k, v in terms.items()}}
-        if not np.isfinite(row["loss"]):
-            raise PdkitError(f"The imitation loss became {row['loss']} at iteration {iteration}; lower lr (now {config.lr}).")
+        row = checkpoint_row(iteration, started, terms, config.lr)
         score = float(iteration)  # without evaluations the latest wins
         with average.in_place() if average else contextlib.nullcontext():
             if config.eval_episodes:

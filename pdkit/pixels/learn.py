@@ -17,11 +17,10 @@ from torch import nn
 
 from ..demos.format import Demos
 from ..errors import PdkitError
-from ..imitate import ImitateConfig, Windows, selection_scores
+from ..imitate import ImitateConfig, Windows, checkpoint_row, make_optimizer, minimise, selection_scores
 from ..policies import MLP, POLICIES, BeT, Policy
 from ..tasks import get_task
 from ..tasks.spec import TaskSpec
-from ..torch_setup import autocast
 from .cameras import View, view_of
 from .encoders import FEATURES, Encoder, random_shift
 from .pictures import Pictures, encoded
@@ -57,28 +56,25 @@ def imitate_pixels(kind: str, demos: Demos, pictures: Pictures, config: ImitateC
     windows = Windows(dataclasses.replace(demos, observations=numbered), policy.window, config.pad_start, policy.horizon, spec.resting,
                       config.hold_end)
     rgb, depth = torch.from_numpy(pictures.rgb), torch.from_numpy(pictures.depth.astype(np.int32))
-    groups = [*policy.parameter_groups(config.weight_decay), {"params": list(encoder.parameters()), "weight_decay": config.weight_decay}]
-    optimizer = torch.optim.AdamW(groups, lr=config.lr, betas=(config.beta1, 0.999), fused=True)
+    optimizer = make_optimizer(policy, config, [{"params": list(encoder.parameters()), "weight_decay": config.weight_decay}])
     rates = torch.optim.lr_scheduler.LambdaLR(optimizer, config.lr_factor)
-    history, best, chosen, started = [], -1.0, None, time.monotonic()
-    for iteration in range(1, config.iterations + 1):
+
+    def loss() -> dict[str, torch.Tensor]:
         observations, actions = windows.sample(config.batch, generator)
         frames = observations[..., 0].long().flatten()
-        with autocast("cpu", config.bf16):
-            seen = torch.cat([rgb[frames].int(), depth[frames]], dim=1)
-            if shift:
-                seen = random_shift(seen, shift, generator)
-            features = encoder(*seen.split([rgb.shape[1], depth.shape[1]], dim=1)).unflatten(0, observations.shape[:2])
-            terms = policy.loss(torch.cat([observations[..., 1:], features.float()], dim=-1), actions)
-        optimizer.zero_grad(set_to_none=True)
-        terms["loss"].backward()
-        optimizer.step()
+        seen = torch.cat([rgb[frames].int(), depth[frames]], dim=1)
+        if shift:
+            seen = random_shift(seen, shift, generator)
+        features = encoder(*seen.split([rgb.shape[1], depth.shape[1]], dim=1)).unflatten(0, observations.shape[:2])
+        return policy.loss(torch.cat([observations[..., 1:], features.float()], dim=-1), actions)
+
+    history, best, chosen, started = [], -1.0, None, time.monotonic()
+    for iteration in range(1, config.iterations + 1):
+        terms = minimise(loss, optimizer, "cpu", config.bf16)
         rates.step()
         if iteration % config.eval_every and iteration < config.iterations:
             continue
-        row = {"iteration": iteration, "seconds": time.monotonic() - started, **{k: float(v.detach()) for k, v in terms.items()}}
-        if not np.isfinite(row["loss"]):
-            raise PdkitError(f"The imitation loss became {row['loss']} at iteration {iteration}; lower lr (now {config.lr}).")
+        row = checkpoint_row(iteration, started, terms, config.lr)
         candidate = _finished(policy, encoder, demos, pictures)
         row |= selection_scores(pixel_spec(spec, candidate[1]), candidate[0], config)
         score = row.get("success_once", float(iteration))  # without evaluations the latest wins

@@ -9,6 +9,7 @@ from ..claims import (
     NEARLY,
     TASKS,
     Finding,
+    ahead,
     best,
     by_seed,
     compared,
@@ -20,7 +21,6 @@ from ..claims import (
     percent,
     points,
     recorded,
-    weakest,
 )
 from .registry import EIGHT, measures
 
@@ -43,14 +43,7 @@ def _() -> Finding:
 def _() -> Finding:
     """Ahead of the best of both kinds; the interval is that of the smaller lead."""
     table, _ = recorded(RECORD)
-    own, leads = by_seed(table, OWN, "decorated_success"), []
-    for kind, recipes in (("no fine-tuning", KEPT), ("fine-tuning", TUNED)):
-        rival = best(table, recipes)
-        interval, values = difference(own, by_seed(table, rival, "decorated_success"))
-        leads.append((interval, values, f"{100 * interval.value:+.1f} points against {rival} (best of {kind})"))
-    interval, values, _ = min(leads, key=lambda lead: lead[0].value)
-    return finding(RECORD, values, f"{percent(own.mean())}: " + ", ".join(lead[2] for lead in leads), points(interval),
-                   weakest(*(judged(lead[0]) for lead in leads)), EIGHT)
+    return ahead(RECORD, table, OWN, {"no fine-tuning": KEPT, "fine-tuning": TUNED}, EIGHT)
 
 
 @measures("The best baseline that fine-tunes Diffusion Policy")

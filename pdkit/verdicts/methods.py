@@ -17,6 +17,7 @@ from ..claims import (
     TASKS,
     Finding,
     TooLittle,
+    ahead,
     best,
     by_seed,
     compared,
@@ -83,15 +84,7 @@ def _() -> Finding:
 def _() -> Finding:
     """Ahead of the best of both kinds; the interval is that of the smaller lead. Others than the paper's baselines are told beside it."""
     table = _on_bet()
-    leads = []
-    for kind, recipes in (("no fine-tuning", OTHERS), ("fine-tuning", FINE_TUNING)):
-        rival = best(table, recipes)
-        interval, values = difference(by_seed(table, DECORATOR, "decorated_success"), by_seed(table, rival, "decorated_success"))
-        leads.append((interval, values, f"{100 * interval.value:+.1f} points against {rival} (best of {kind})"))
-    interval, values, _ = min(leads, key=lambda lead: lead[0].value)
-    own = by_seed(table, DECORATOR, "decorated_success").mean()
-    return finding("leaderboard", values, f"{percent(own)}: " + ", ".join(lead[2] for lead in leads) + _besides(table), points(interval),
-                   weakest(*(judged(lead[0]) for lead in leads)), EIGHT)
+    return ahead("leaderboard", table, DECORATOR, {"no fine-tuning": OTHERS, "fine-tuning": FINE_TUNING}, EIGHT, _besides(table))
 
 
 @measures("The best baseline that fine-tunes BeT (36.7 %)")
