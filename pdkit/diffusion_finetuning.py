@@ -33,7 +33,7 @@ from .probes import PROBES, ReachSim
 from .profiles import build
 from .rl.dipo import DIPO
 from .rl.dppo import DPPO
-from .stats import Interval, Rate, wilson
+from .stats import newcombe, wilson
 from .tasks.spec import TaskSpec
 
 AIM = np.array([0.55, -0.1])  # where the demonstrator of the drawn problem aims; solved within 0.5 of (0.5, 0.5)
@@ -254,11 +254,3 @@ def outcomes(table: pd.DataFrame, ends: str = "success") -> pd.DataFrame:
         verdict = "above" if change.low > 0 else "below" if change.high < 0 else "not told apart"
         rows.append({"recipe": row.recipe, "seed": row.seed, "before": before, "after": after, "difference": change, "verdict": verdict})
     return pd.DataFrame(rows, columns=["recipe", "seed", "before", "after", "difference", "verdict"])
-
-
-def newcombe(first: Rate, second: Rate) -> Interval:
-    """second - first with the interval of two independent rates that follows from theirs (Newcombe, Statistics in Medicine 17, 1998,
-    873: method 10)."""
-    change = second.value - first.value
-    return Interval(change, change - float(np.hypot(second.value - second.low, first.high - first.value)),
-                    change + float(np.hypot(second.high - second.value, first.value - first.low)))

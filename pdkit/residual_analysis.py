@@ -27,7 +27,7 @@ from .tasks.spec import TaskSpec
 from .tasks.vector import VectorEnv
 
 PALM = slice(29, 32)  # Door's observation: position of the palm in m
-FEATURES = ("raw", "GPT", "FiLM")  # what VINN can look up by here; images (Table 13) need a policy that the kit does not have
+FEATURES = ("raw", "GPT", "FiLM")  # what VINN can look up by here; images (Table 13) are left out: its demonstrations are states
 
 
 # ---- the first episodes ----------------------------------------------------------------------------------------------

@@ -1,7 +1,7 @@
 """Intervals and comparisons for success rates: pure functions, each with its source.
 
-Rates of one policy: Wilson's score interval. Two policies on the same seeds: Tango's score interval for the difference
-and McNemar's exact test, both of which use only the seeds on which the two disagree. Several runs on several tasks: the
+Rates of one policy: Wilson's score interval. Two independent rates: Newcombe's. Two policies on the same seeds: Tango's score interval
+for the difference and McNemar's exact test, both of which use only the seeds on which the two disagree. Several runs on several tasks: the
 interquartile mean and the probability of improvement with a stratified bootstrap (Agarwal et al., 2021, "Deep RL at the
 edge of the statistical precipice"), as in rliable but with an explicit seed.
 """
@@ -93,6 +93,14 @@ def wilson(successes: int, n: int, confidence: float = 0.95) -> Rate:
     low, high = (centre - half) / (1 + z * z / n), (centre + half) / (1 + z * z / n)
     # At 0 and n the limits are 0 and 1 up to rounding.
     return Rate(int(successes), int(n), 0.0 if successes == 0 else float(low), 1.0 if successes == n else float(high))
+
+
+def newcombe(first: Rate, second: Rate) -> Interval:
+    """second - first with the interval of two independent rates that follows from theirs (Newcombe, Statistics in Medicine 17, 1998,
+    873: method 10)."""
+    change = second.value - first.value
+    return Interval(change, change - float(np.hypot(second.value - second.low, first.high - first.value)),
+                    change + float(np.hypot(second.high - second.value, first.value - first.low)))
 
 
 def mcnemar(gained: int, lost: int) -> float:

@@ -97,9 +97,9 @@ def test_a_run_is_judged_by_the_interval_of_its_difference():
     rows = analysis.outcomes(table)
     assert rows.verdict.tolist() == ["above", "not told apart", "below"] and rows.after[0].successes == 48
     assert analysis.outcomes(table, "success_at_end").verdict.tolist() == ["not told apart", "below", "above"]
-    change = analysis.newcombe(stats.wilson(48, 70), stats.wilson(56, 70))  # Newcombe's own example (1998, Table II a): 0.0524 to 0.3339
+    change = stats.newcombe(stats.wilson(48, 70), stats.wilson(56, 70))  # Newcombe's own example (1998, Table II a): 0.0524 to 0.3339
     assert change.value == pytest.approx(8 / 70) and analysis.outcomes(table.iloc[:0]).empty
-    turned = analysis.newcombe(stats.wilson(48, 80), stats.wilson(56, 70))
+    turned = stats.newcombe(stats.wilson(48, 80), stats.wilson(56, 70))
     assert (turned.low, turned.high) == pytest.approx((0.0524, 0.3339), abs=5e-4)
 
 
