@@ -5,12 +5,13 @@ from __future__ import annotations
 import contextlib
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
+from torch import nn
 
 from .demos.format import Demos
 from .errors import PdkitError, unknown
@@ -100,12 +101,12 @@ class Windows:
 
 
 class Average:
-    """The exponentially averaged weights of a policy in training (diffusers' EMAModel, whose decay rises with the steps)."""
+    """The exponentially averaged weights of what is in training (diffusers' EMAModel, whose decay rises with the steps)."""
 
-    def __init__(self, policy: Policy, power: float):
+    def __init__(self, parameters: Iterable[nn.Parameter], power: float):
         from diffusers.training_utils import EMAModel
 
-        self._parameters = list(policy.parameters())
+        self._parameters = list(parameters)
         self._ema = EMAModel(self._parameters, use_ema_warmup=True, power=power)
 
     def step(self) -> None:
@@ -114,7 +115,7 @@ class Average:
 
     @contextlib.contextmanager
     def in_place(self) -> Iterator[None]:
-        """Within this block the policy has the averaged weights."""
+        """Within this block they have the averaged weights."""
         self._ema.store(self._parameters)
         self._ema.copy_to(self._parameters)
         try:
@@ -179,7 +180,7 @@ def imitate(kind: str, demos: Demos, config: ImitateConfig | None = None, policy
         return policy.eval(), [row]
     optimizer = make_optimizer(policy, config)
     rates = torch.optim.lr_scheduler.LambdaLR(optimizer, config.lr_factor)
-    average = Average(policy, config.ema_power) if config.ema_power else None
+    average = Average(policy.parameters(), config.ema_power) if config.ema_power else None
     history, best, best_state, started = [], -1.0, None, time.monotonic()
     for iteration in range(1, config.iterations + 1):
         terms = gradient_step(policy, optimizer, *(x.to(device) for x in windows.sample(config.batch, generator)), config.bf16)

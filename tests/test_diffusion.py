@@ -193,7 +193,7 @@ def test_averaged_weights_are_in_place_only_while_asked():
     with torch.no_grad():
         for parameter in p.parameters():
             parameter.zero_()
-    average, expected = Average(p, 0.75), 0.0
+    average, expected = Average(p.parameters(), 0.75), 0.0
     for step in range(1, 5):
         with torch.no_grad():
             for parameter in p.parameters():

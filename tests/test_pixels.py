@@ -25,7 +25,7 @@ from pdkit.pixels.learn import imitate_pixels, renormalise
 from pdkit.pixels.pictures import draw, encoded, load_pictures, picture_file, pictures_of, save_pictures
 from pdkit.pixels.sim import PixelSim, panels
 from pdkit.pixels.task import encoder_of, pixel_spec, save_visual
-from pdkit.policies import MLP, BeT, load_policy
+from pdkit.policies import MLP, BeT, DiffusionPolicy, load_policy
 from pdkit.probes import PROBES
 from pdkit.profiles import online_config
 from pdkit.runs import Run, origin
@@ -254,22 +254,28 @@ def test_encoded_demonstrations_show_state_then_features(painted):
 
 # ---- imitation -------------------------------------------------------------------------------------------------------
 
-@pytest.mark.parametrize(("kind", "config"), [(MLP, {}), (BeT, {"window": 3, "embed": 32, "layers": 1, "bins": 4})])
+SMALL = {"window": 1, "horizon": 2, "chunk": 1, "dims": [16, 32], "groups": 4, "embed": 16, "prediction": "v_prediction"}  # diffusion
+
+
+@pytest.mark.parametrize(("kind", "config"), [(MLP, {}), (BeT, {"window": 3, "embed": 32, "layers": 1, "bins": 4}),
+                                              (DiffusionPolicy, SMALL | {"own_scale": True, "window": 2})])
 def test_renormalising_keeps_the_policy(kind, config):
     rng = np.random.default_rng(0)
     policy = kind({"obs_dim": 6, "act_dim": 2, **config}).eval()
     observations = rng.normal(3, 2, (50, 6)).astype(np.float32)
     policy.fit_statistics(observations * 0.1, rng.uniform(-1, 1, (50, 2)).astype(np.float32))
     windows = rng.normal(3, 2, (7, policy.window, 6)).astype(np.float32)
+    policy.reset(0)
     before = policy.act(windows)
     renormalise(policy, observations)
+    policy.reset(0)
     np.testing.assert_allclose(policy.act(windows), before, atol=1e-4)
     np.testing.assert_allclose(policy.normalizer.mean.numpy(), observations.mean(0), atol=1e-5)
 
 
 def test_only_some_policies_see():
-    with pytest.raises(PdkitError, match="kinds mlp and bet, not diffusion"):
-        imitate_pixels("diffusion", reach_demos(1), None, ImitateConfig(), spec=PROBES["reach"], view=REACH)
+    with pytest.raises(PdkitError, match="kinds mlp, bet and diffusion, not rnn"):
+        imitate_pixels("rnn", reach_demos(1), None, ImitateConfig(), spec=PROBES["reach"], view=REACH)
 
 
 @pytest.fixture(scope="module")
@@ -291,7 +297,9 @@ def test_what_imitation_leaves(sighted):
     assert not any(p.requires_grad for p in encoder.parameters()) and not policy.training
 
 
-def test_what_only_pictures_show_is_learned(monkeypatch):
+@pytest.mark.parametrize(("kind", "config", "settings"), [
+    ("mlp", {"hidden": 16}, {}), ("diffusion", SMALL, {"ema_power": 0.75, "iterations": 90})])
+def test_what_only_pictures_show_is_learned(monkeypatch, kind, config, settings):
     """The lever must be pulled to the side on which the picture is bright; the robot's state is empty."""
 
     class Side(Painted):
@@ -306,8 +314,9 @@ def test_what_only_pictures_show_is_learned(monkeypatch):
     demos = Demos("lever", "scripted", "test", "-", side.repeat(2, axis=0), side, np.ones(12, bool), np.ones(12, np.int64), np.arange(12))
     view = View("lever", ("front",), 64, 64, False, ((0, 0),), 2)
     pictures = draw(demos, spec=PROBES["lever"], view=view)
-    config = ImitateConfig(iterations=60, batch=16, lr=3e-3, eval_every=60, eval_episodes=8, bf16=False)
-    _, _, history = imitate_pixels("mlp", demos, pictures, config, {"hidden": 16}, spec=PROBES["lever"], view=view)
+    training = ImitateConfig(**{"iterations": 60, "batch": 16, "lr": 3e-3, "eval_every": 90, "eval_episodes": 8, "bf16": False, **settings})
+    policy, _, history = imitate_pixels(kind, demos, pictures, training, config, spec=PROBES["lever"], view=view)
+    assert policy.normalizer.std[1:].max() > 0.1  # fitted to the features: some of them vary
     assert history[-1]["success_once"] == 1.0, history  # blind, half
 
 
@@ -319,6 +328,16 @@ def test_a_visual_policy_on_disk(sighted, tmp_path):
     np.testing.assert_array_equal(again.act(windows), policy.act(windows))
     assert torch.equal(eyes.net.fc.weight, encoder.net.fc.weight)
     assert (tmp_path / "v" / "encoder" / "weights.safetensors").stat().st_size < 1.4e6  # two bytes a weight
+
+
+def test_averaged_weights_are_those_of_policy_and_encoder(painted):
+    """With an average that remembers, what is kept is not what training ended with."""
+    demos = reach_demos(8)
+    pictures = draw(demos, spec=PROBES["reach"], view=REACH)
+    plain, averaged = (imitate_pixels("mlp", demos, pictures, ImitateConfig(iterations=6, batch=8, eval_episodes=0, ema_power=power),
+                                      {"hidden": 16}, spec=PROBES["reach"], view=REACH) for power in (0.0, 0.75))
+    for one, other in zip(plain[:2], averaged[:2], strict=True):  # policy, encoder
+        assert not torch.equal(next(one.parameters()), next(other.parameters()))
 
 
 # ---- online ----------------------------------------------------------------------------------------------------------
@@ -477,7 +496,7 @@ def test_figures_of_views_and_shifts():
 # ---- what is refused before anything is drawn -----------------------------------------------------------------------
 
 @pytest.mark.parametrize(("words", "message"), [
-    (["base", "Door", "--policy", "diffusion", "--pixels"], "kinds mlp and bet"),
+    (["base", "Door", "--policy", "cnn", "--pixels"], "kinds mlp, bet and diffusion"),
     (["base", "Door", "--policy", "mlp", "--pixels", "--set", "random_shift=-1"], "whole number"),
     (["base", "Door", "--policy", "mlp", "--pixels", "--set", "random_shift=0.5"], "whole number"),
     (["decorated", "Pen", "--pixels", "--base", str(DATA / "checkpoints" / "Door" / "pixels" / "base")], "robot of Door, not of Pen")])

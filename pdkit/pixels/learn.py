@@ -1,11 +1,12 @@
 """Imitation from pictures: an encoder and a policy behind it, trained together (facts.md 2.2: end to end, random shift).
 
 The policy is one of the ordinary kinds; what it sees at each step is the robot's state and the encoder's features. Afterwards its
-normaliser is fitted to the features as well, and its first layer changed so that it computes what it did: the learner of online RL
-sees observations through that normaliser.
+normaliser is fitted to the features as well, and the policy changed so that it computes what it did: the learner of online RL sees
+observations through that normaliser.
 """
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import time
 from collections.abc import Callable
@@ -17,8 +18,8 @@ from torch import nn
 
 from ..demos.format import Demos
 from ..errors import PdkitError
-from ..imitate import ImitateConfig, Windows, checkpoint_row, make_optimizer, minimise, selection_scores
-from ..policies import MLP, POLICIES, BeT, Policy
+from ..imitate import Average, ImitateConfig, Windows, checkpoint_row, make_optimizer, minimise, selection_scores
+from ..policies import MLP, POLICIES, BeT, DiffusionPolicy, Policy
 from ..tasks import get_task
 from ..tasks.spec import TaskSpec
 from .cameras import View, view_of
@@ -26,7 +27,7 @@ from .encoders import FEATURES, Encoder, random_shift
 from .pictures import Pictures, encoded
 from .task import pixel_spec
 
-HEADS = ("mlp", "bet")
+HEADS = ("mlp", "bet", "diffusion")
 
 
 def imitate_pixels(kind: str, demos: Demos, pictures: Pictures, config: ImitateConfig, policy_config: dict | None = None, *,
@@ -39,13 +40,12 @@ def imitate_pixels(kind: str, demos: Demos, pictures: Pictures, config: ImitateC
     a checkpoint as `imitate` does. Raises PdkitError for a kind of policy that is not one of HEADS, or a loss that is no number.
     """
     check_pixels(kind, shift)
-    if config.ema_power:
-        raise PdkitError("Policies that see pictures are trained without averaged weights; leave ema_power at 0.")
     view, spec = view or view_of(demos.task), spec or get_task(demos.task)
     shift = view.shift if shift is None else shift
     torch.manual_seed(config.seed)
     generator = torch.Generator().manual_seed(config.seed)
-    policy = POLICIES[kind]({"obs_dim": view.state_dim + FEATURES, "act_dim": spec.act_dim, **(policy_config or {})})
+    settings = {"own_scale": True} if kind == "diffusion" else {}
+    policy = POLICIES[kind]({"obs_dim": view.state_dim + FEATURES, "act_dim": spec.act_dim, **settings, **(policy_config or {})})
     encoder = Encoder(view)
     state = view.robot(demos.observations)
     unscaled = np.zeros((len(state), FEATURES), np.float32)  # a number that never varies is passed through by the normaliser
@@ -58,6 +58,7 @@ def imitate_pixels(kind: str, demos: Demos, pictures: Pictures, config: ImitateC
     rgb, depth = torch.from_numpy(pictures.rgb), torch.from_numpy(pictures.depth.astype(np.int32))
     optimizer = make_optimizer(policy, config, [{"params": list(encoder.parameters()), "weight_decay": config.weight_decay}])
     rates = torch.optim.lr_scheduler.LambdaLR(optimizer, config.lr_factor)
+    average = Average([*policy.parameters(), *encoder.parameters()], config.ema_power) if config.ema_power else None
 
     def loss() -> dict[str, torch.Tensor]:
         observations, actions = windows.sample(config.batch, generator)
@@ -72,10 +73,13 @@ def imitate_pixels(kind: str, demos: Demos, pictures: Pictures, config: ImitateC
     for iteration in range(1, config.iterations + 1):
         terms = minimise(loss, optimizer, "cpu", config.bf16)
         rates.step()
+        if average:
+            average.step()
         if iteration % config.eval_every and iteration < config.iterations:
             continue
         row = checkpoint_row(iteration, started, terms, config.lr)
-        candidate = _finished(policy, encoder, demos, pictures)
+        with average.in_place() if average else contextlib.nullcontext():
+            candidate = _finished(policy, encoder, demos, pictures)
         row |= selection_scores(pixel_spec(spec, candidate[1]), candidate[0], config)
         score = row.get("success_once", float(iteration))  # without evaluations the latest wins
         if score > best:
@@ -89,7 +93,7 @@ def imitate_pixels(kind: str, demos: Demos, pictures: Pictures, config: ImitateC
 def check_pixels(kind: str, shift: Any) -> None:
     """Raises PdkitError for a kind of policy that is not one of HEADS, or a shift (None: the view's) that is no whole number from 0 on."""
     if kind not in HEADS:
-        raise PdkitError(f"Policies that see pictures are of the kinds {' and '.join(HEADS)}, not {kind}.")
+        raise PdkitError(f"Policies that see pictures are of the kinds {', '.join(HEADS[:-1])} and {HEADS[-1]}, not {kind}.")
     if shift is not None and (type(shift) is not int or shift < 0):
         raise PdkitError(f"random_shift counts pixels: it must be a whole number from 0 on, not {shift!r}.")
 
@@ -117,10 +121,13 @@ def rounded(module: nn.Module) -> nn.Module:
 
 @torch.no_grad()
 def renormalise(policy: Policy, observations: np.ndarray) -> None:
-    """Fit the normaliser of an MLP or BeT to observations (N, obs_dim), and change its first layer so that the policy stays the same.
+    """Fit the normaliser to observations (N, obs_dim), and change the first layer of an MLP or BeT so that the policy stays the same.
 
     With x = mean + std n the layer W (x - mean0) / std0 + b becomes W (std / std0) n + b + W (mean - mean0) / std0.
     """
+    if isinstance(policy, DiffusionPolicy):
+        policy.renormalise(observations)
+        return
     layer = policy.net[0] if isinstance(policy, MLP) else policy.gpt.inp
     assert isinstance(policy, MLP | BeT)
     mean, std = policy.normalizer.mean.clone(), policy.normalizer.std.clone()

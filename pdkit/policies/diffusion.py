@@ -33,12 +33,13 @@ PREDICTIONS = ("epsilon", "v_prediction")
 class DiffusionPolicy(Policy):
     """Config: obs_dim, act_dim, window (observations), horizon (actions predicted), chunk (of them executed), dims, kernel, groups and
     embed of the U-Net, diffusion_steps of training, prediction ("epsilon", "v_prediction"), sampler ("ddim", "ddpm"), sampler_steps,
-    spacing (of DDIM's steps: "leading", "trailing"), and late_steps (the last so many steps of sampling have a network of their own; 0: one
-    for all)."""
+    spacing (of DDIM's steps: "leading", "trailing"), late_steps (the last so many steps of sampling have a network of their own; 0: one
+    for all), and own_scale (the network's scale of observations is kept apart from the normaliser's: see `renormalise`)."""
 
     kind = "diffusion"
     defaults: dict[str, Any] = dict(window=2, horizon=16, chunk=4, dims=[64, 128, 256], kernel=5, groups=8, embed=64, diffusion_steps=100,
-                                    prediction="epsilon", sampler="ddim", sampler_steps=4, spacing="leading", late_steps=0)
+                                    prediction="epsilon", sampler="ddim", sampler_steps=4, spacing="leading", late_steps=0,
+                                    own_scale=False)
     least = dict(embed=4, late_steps=0)
     recipe: dict[str, Any] = dict(lr=1e-4, beta1=0.95, weight_decay=1e-6, schedule="cosine", lr_warmup=500, ema_power=0.75)
 
@@ -61,6 +62,7 @@ class DiffusionPolicy(Policy):
         if not 1 <= c["sampler_steps"] <= c["diffusion_steps"]:
             raise PdkitError(f"sampler_steps must be from 1 to diffusion_steps ({c['diffusion_steps']}), not {c['sampler_steps']}.")
         self.normalizer = Normalizer(c["obs_dim"])
+        self.scale = Normalizer(c["obs_dim"]) if c["own_scale"] else None
         self.unet = UNet(c["act_dim"], c["obs_dim"] * self.window, tuple(c["dims"]), c["kernel"], c["groups"], c["embed"])
         self.noise = _scheduler("ddpm", c)
         self.sampler = _scheduler(c["sampler"], c)
@@ -86,7 +88,19 @@ class DiffusionPolicy(Policy):
 
     def condition(self, windows: torch.Tensor) -> torch.Tensor:
         """What the U-Net sees of windows (N, window, obs_dim): (N, window * obs_dim)."""
-        return self.normalizer(windows).flatten(1)
+        normal = self.normalizer(windows)
+        return (normal if self.scale is None else self.scale(normal)).flatten(1)
+
+    @torch.no_grad()
+    def renormalise(self, observations: np.ndarray) -> None:
+        """Fit the normaliser to observations (N, obs_dim) while the network goes on to see what it saw: its own scale undoes the change.
+
+        No layer could take the change in, as an MLP's first does: the condition goes through Mish first.
+        """
+        mean, std = self.normalizer.mean.clone(), self.normalizer.std.clone()
+        self.normalizer.fit(observations)
+        self.scale.mean.copy_((mean - self.normalizer.mean) / self.normalizer.std)
+        self.scale.std.copy_(std / self.normalizer.std)
 
     def film(self) -> nn.Linear:
         """A copy of what turns an activated condition (N, window * obs_dim) into the scales and shifts of all blocks of the U-Net, as far
