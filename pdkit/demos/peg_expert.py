@@ -18,11 +18,9 @@ class _Scene:
 
     tool: np.ndarray
     tool_turn: Rotation
-    opening: float  # how far each finger is from the middle
     peg: np.ndarray
     peg_turn: Rotation
     half_length: float
-    radius: float
     hole: np.ndarray
     hole_turn: Rotation
 
@@ -30,7 +28,7 @@ class _Scene:
     def of(cls, observation: np.ndarray) -> _Scene:
         o = observation.astype(np.float64)
         tool, peg, hole = o[TOOL], o[32:39], o[42:49]
-        return cls(tool[:3], turn(tool[3:]), o[7:9].mean(), peg[:3], turn(peg[3:]), o[39], o[40], hole[:3], turn(hole[3:]))
+        return cls(tool[:3], turn(tool[3:]), peg[:3], turn(peg[3:]), o[39], hole[:3], turn(hole[3:]))
 
     @property
     def head(self) -> np.ndarray:
@@ -40,11 +38,6 @@ class _Scene:
     def grip(self) -> np.ndarray:
         """Where to take the peg: far enough towards the tail that the fingers stay clear of the box."""
         return self.peg - self.peg_turn.apply(X) * max(0.05, self.half_length / 2 + 0.01)
-
-    @property
-    def held(self) -> bool:
-        """Whether the peg is between the fingers."""
-        return bool(np.linalg.norm(self.tool - self.grip) < 0.025 and self.opening < self.radius + 0.0025)
 
     @property
     def head_in_hole(self) -> np.ndarray:
@@ -58,62 +51,116 @@ class _Scene:
 
 
 class PegInsertionSideExpert:
-    """A proportional controller whose action is a function of the observation alone.
+    """A proportional controller from stage to stage, with an integral part while the peg is lined up.
 
-    It remembers no stage and sums up no error, because a policy that sees one observation could imitate neither: it would stop
-    between two stages. What would need the sum is known beforehand: the controller's targets start from where the arm *is*, so
-    the arm comes to rest a few millimetres below what proportional control asks for, and the hole is only 3 mm wider than the peg.
+    The controller's targets start from where the arm *is*, so the arm hangs below what proportional control asks for; the hole
+    is only 3 mm wider than the peg, which is why the remaining error has to be summed up and pushed against.
     `noise` is the standard deviation of what is added to displacement and rotation (1 is 10 cm and 0.1 rad a step); a tenth of
-    it where the peg is lined up and pushed in, since 0.1 would already be 1 cm.
+    it from where the peg is lined up, since 0.1 would already be 1 cm.
     """
 
     CALM = 0.1  # how much of the noise is left at the hole
-    BEFORE = 0.03  # how far before the hole the peg's head is lined up, metres
-    ABOVE = 0.08  # how far over the peg the hand is until it is in place, metres
-    GAIN, TURN_GAIN = 6, 6  # of the peg; actions per metre or radian still to go
-    HANG = np.array([0.015, 0.0, 0.025])  # what keeps the arm from hanging, in actions; measured
-    TURN_HANG = np.array([0.0, -0.054, 0.0])
+    SQUEEZE = 5  # steps for the fingers to close
+    STEADY = 3  # steps that the peg must stay lined up
+    BEFORE = 0.03  # how far before the hole the peg's head waits, metres
+    JAMMED, BACK = 9, 6  # steps without progress; steps of going back then
 
     def __init__(self, noise: float = 0.0):
         self.noise = noise
 
     def reset(self, rng: np.random.Generator) -> None:
         self._rng = rng
+        self._stage, self._waited = "reach", 0
+        self._hand = None  # how the hand is held while it grasps, Rotation
+        self._forget_errors()
 
     def act(self, observation: np.ndarray) -> np.ndarray:
         scene = _Scene.of(observation)
-        return self._carry(scene) if scene.held else self._fetch(scene)
+        self._advance(scene)
+        if self._stage in ("align", "insert"):
+            move, turning = self._steer_peg(scene)
+        else:
+            move, turning = self._steer_hand(scene)
+        gripper = OPEN if self._stage in ("reach", "descend") else CLOSED
+        noise = self.noise * (self.CALM if self._stage in ("align", "insert") else 1)
+        return pose_action(move, turning, gripper, noise, self._rng)
 
-    def _fetch(self, scene: _Scene) -> np.ndarray:
-        """Over the peg's tail, turning the fingers to its sides; then down; then close them."""
-        away = scene.tool - scene.grip
-        turning = (_across(scene) * scene.tool_turn.inv()).as_rotvec()
-        if np.linalg.norm(away) < 0.012:
-            return pose_action(np.zeros(3), 6 * turning, CLOSED, self.noise, self._rng)
-        in_place = min(_fades(np.linalg.norm(away[:2]), 0.006, 0.02), _fades(np.linalg.norm(turning), 0.05, 0.2))
-        return pose_action(8 * (UP * self.ABOVE * (1 - in_place) - away), 6 * turning, OPEN, self.noise, self._rng)
+    def _forget_errors(self) -> None:
+        self._sum, self._turn_sum = UP * 0.005, np.zeros(3)  # metres, radians; the arm hangs 5 mm low with a peg in its hand
+        self._furthest, self._stuck = -np.inf, 0
 
-    def _carry(self, scene: _Scene) -> np.ndarray:
-        """Up to the hole's height; before the hole, turning into its direction; in, as far as the peg is straight."""
-        inwards, beside = scene.head_in_hole[0], np.linalg.norm(scene.head_in_hole[1:])
+    def _advance(self, scene: _Scene) -> None:
+        """Go on to the next stage where its condition is met; start again with a dropped peg."""
+        if self._stage not in ("reach", "descend", "grasp") and np.linalg.norm(scene.tool - scene.grip) > 0.08:
+            self._stage, self._hand = "reach", None
+        if self._hand is None:
+            self._hand = _across(scene)
+        if self._stage == "reach":
+            above = np.linalg.norm((scene.tool - scene.grip)[:2]) < 0.008
+            if above and np.linalg.norm((self._hand * scene.tool_turn.inv()).as_rotvec()) < 0.06:
+                self._stage = "descend"
+        if self._stage == "descend" and np.linalg.norm(scene.tool - scene.grip) < 0.01:
+            self._stage, self._waited = "grasp", 0
+        if self._stage == "grasp":
+            self._waited += 1
+            if self._waited >= self.SQUEEZE:
+                self._stage, self._height = "lift", max(scene.peg[2] + 0.06, scene.hole[2])
+        if self._stage == "lift" and abs(self._height - scene.peg[2]) < 0.01:
+            self._stage, self._waited = "align", 0
+            self._forget_errors()
+        inwards, sideways, askew = self._errors(scene)
+        if self._stage == "align":
+            ready = abs(inwards + scene.half_length + self.BEFORE) < 0.02 and sideways < 0.0025 and askew < 0.025
+            self._waited = self._waited + 1 if ready else 0
+            if self._waited >= self.STEADY:
+                self._stage = "insert"
+        if self._stage == "insert" and inwards < -scene.half_length - 0.003 and (sideways > 0.006 or askew > 0.06):
+            self._stage, self._waited = "align", 0
+            self._forget_errors()
+
+    @staticmethod
+    def _errors(scene: _Scene) -> tuple[float, float, float]:
+        """How far the head is in the hole (negative: before its middle), beside its axis, metres, and how much askew, radians."""
+        head = scene.head_in_hole
+        return head[0], float(np.linalg.norm(head[1:])), float(np.linalg.norm(scene.misalignment))
+
+    def _steer_hand(self, scene: _Scene) -> tuple[np.ndarray, np.ndarray]:
+        """Before the peg is in the air: the hand's own displacement and rotation, in units of the action."""
+        turning = 6 * (self._hand * scene.tool_turn.inv()).as_rotvec()
+        if self._stage == "grasp":
+            return np.zeros(3), turning
+        if self._stage == "lift":
+            return 8 * UP * (self._height - scene.peg[2]), np.zeros(3)
+        return 8 * (scene.grip + UP * (0.08 if self._stage == "reach" else 0) - scene.tool), turning
+
+    def _steer_peg(self, scene: _Scene) -> tuple[np.ndarray, np.ndarray]:
+        """Move the hand so that the peg's head goes where it should and the peg turns about its head into the hole's direction."""
+        inwards, sideways, askew = self._errors(scene)
         waiting = -(scene.half_length + self.BEFORE)
-        outside = inwards < -scene.half_length - 0.005 or beside > 0.006  # so far beside the axis it is jammed on the face
-        straight = min(_fades(beside, 0.002, 0.005), _fades(np.linalg.norm(scene.misalignment), 0.02, 0.06))
-        raised = _fades(abs(scene.hole[2] - scene.peg[2]), 0.01, 0.04) if outside else 1.0
-        goal = inwards + 0.03
-        if outside:
-            goal = waiting + (goal - waiting) * straight * (inwards > waiting - 0.02)
-        misalignment = scene.misalignment * raised
+        goal = waiting if self._stage == "align" else self._push(inwards)
+        misalignment = scene.misalignment
+        near = self._stage == "insert" or abs(inwards - waiting) < 0.05
+        if near and sideways < 0.012 and askew < 0.1:
+            beside = scene.head_in_hole * [0, -1, -1]
+            self._sum = np.clip(self._sum + 0.15 * scene.hole_turn.apply(beside), -0.03, 0.03)
+            self._turn_sum = np.clip(self._turn_sum + 0.06 * misalignment, -0.15, 0.15)
         head = scene.hole + scene.hole_turn.apply(X) * goal
-        move = head + Rotation.from_rotvec(misalignment).apply(scene.tool - scene.head) - scene.tool  # the peg turns about its head
-        move = raised * move + (1 - raised) * UP * (scene.hole[2] - scene.peg[2])
-        noise = self.noise * (self.CALM if abs(inwards - waiting) < 0.05 or not outside else 1)
-        return pose_action(self.GAIN * move + self.HANG, self.TURN_GAIN * misalignment + self.TURN_HANG, CLOSED, noise, self._rng)
+        tool = head + self._sum + Rotation.from_rotvec(misalignment).apply(scene.tool - scene.head)
+        gain = 6 if self._stage == "insert" else 5 if abs(inwards - waiting) < 0.03 else 8
+        return gain * (tool - scene.tool), 6 * (misalignment + self._turn_sum)
 
-
-def _fades(x: float, full: float, none: float) -> float:
-    """1 up to `full`, 0 from `none` on, falling linearly between them."""
-    return float(np.clip((none - x) / (none - full), 0, 1))
+    def _push(self, inwards: float) -> float:
+        """Where along the hole the head should go next, metres: on, or back for some steps where the peg has jammed."""
+        if inwards > self._furthest + 0.001:
+            self._furthest, self._stuck = inwards, 0
+        else:
+            self._stuck += 1
+        if self._stuck >= self.JAMMED:
+            self._stuck = -self.BACK
+        if self._stuck < 0:
+            self._furthest = inwards
+            return inwards - 0.03
+        return inwards + 0.03  # faster, it would not be straightened in time
 
 
 def _across(scene: _Scene) -> Rotation:

@@ -108,6 +108,8 @@ class DiffusionPolicy(Policy):
         return self.unet.film(self.config["obs_dim"] * self.window)
 
     def loss(self, windows: torch.Tensor, actions: torch.Tensor) -> dict[str, torch.Tensor]:
+        if self.late is not None:
+            raise PdkitError("Imitation trains one network for all steps; leave late_steps at 0 (DPPO gives the last steps a copy of it).")
         noise = torch.randn(actions.shape).to(actions.device)  # drawn on the CPU everywhere: one generator to restore
         steps = torch.randint(self.config["diffusion_steps"], (len(actions),)).to(actions.device)
         predicted = self.unet(self.noise.add_noise(actions, noise, steps), steps, self.condition(windows))
