@@ -27,8 +27,9 @@ from .methods.registry import base_folder as shipped_base
 from .methods.registry import make_trainer, method_config, trainer_of
 from .online import Trainer
 from .online_config import OnlineConfig
+from .pixels.cameras import view_of
 from .pixels.encoders import Encoder, save_encoder
-from .pixels.learn import check_pixels, imitate_pixels
+from .pixels.learn import check_pixels, imitate_pixels, visual_settings
 from .pixels.pictures import encoded, pictures_of
 from .pixels.task import ENCODER, encoder_of, pixel_spec, save_visual
 from .policies import POLICIES, Policy, load_policy, save_policy
@@ -103,10 +104,11 @@ def _base(args) -> int:
     if args.pixels:
         check_pixels(args.policy, shift)
     fields = {f.name for f in dataclasses.fields(ImitateConfig)}
-    architecture = {k: v for k, v in settings.items() if k in POLICIES[args.policy].defaults}
+    given = set(POLICIES[args.policy].defaults) - set(POLICIES[args.policy].made)
+    architecture = {k: v for k, v in settings.items() if k in given}
     for name in settings:
-        if name not in fields | set(architecture):
-            raise unknown("field", name, fields | set(POLICIES[args.policy].defaults))
+        if name not in fields | given:
+            raise unknown("field", name, fields | given)
     config = checked(ImitateConfig, POLICIES[args.policy].recipe | {k: v for k, v in settings.items() if k in fields})
     out = Path(args.out) if args.out else runs_root() / "base" / f"{args.task}-{args.policy}{'-pixels' if args.pixels else ''}"
     print(f"{args.policy} on {demos.num} demonstrations of {args.task} ({demos.label}): {config}", flush=True)
@@ -115,6 +117,8 @@ def _base(args) -> int:
         print("  " + ", ".join(f"{k} {v:.3g}" for k, v in row.items()), flush=True)
 
     if args.pixels:
+        # Wrong settings are refused before anything is drawn.
+        POLICIES[args.policy](visual_settings(args.policy, view_of(args.task), get_task(args.task)) | architecture)
         pictures = pictures_of(demos, Progress(demos.num, "drawn"))
         policy, encoder, history = imitate_pixels(args.policy, demos, pictures, config, architecture, shift=shift, progress=show)
     else:
@@ -188,8 +192,8 @@ def decorate(config, base: Policy, demos: Demos | None, out: Path, episodes: int
     `started_from` (see `origin`) tells which base policy and demonstrations these are; a run is resumed only with the same ones.
     With an `encoder` the task is seen through it, and so are the demonstrations.
     """
-    run = Run(out, "decorated", flat(config) | started_from)
     trainer = make_trainer(config, base, demos, pixel_spec(get_task(config.task), encoder) if encoder else None)
+    run = Run(out, "decorated", flat(config) | started_from)  # after what may be refused
     board, shown = Board(out) if tensorboard else None, set()
 
     def show(t: Trainer) -> None:
@@ -207,7 +211,8 @@ def decorate(config, base: Policy, demos: Demos | None, out: Path, episodes: int
     run.write_metrics(trainer.rows)
     trainer.save_policy(policy, out / "decorated")
     if encoder:
-        save_encoder(encoder, out / "decorated" / "base" / ENCODER)
+        inside = out / "decorated" / "base"  # of a decorated policy; fine-tuning leaves a plain one
+        save_encoder(encoder, (inside if inside.is_dir() else inside.parent) / ENCODER)
     tables = {"base": _base_episodes(base, trainer.spec, episodes, config, started_from),
               "decorated": _episodes(policy, trainer.spec, episodes)}
     for name, table in tables.items():

@@ -89,11 +89,6 @@ def test_sampling_removes_the_noise_that_the_network_tells(sampler, steps, asked
     assert torch.allclose(actions, clean, atol=1e-3) and p.unet.asked == asked
 
 
-def test_a_network_of_the_last_steps_is_not_left_untrained():
-    with pytest.raises(PdkitError, match="leave late_steps at 0"):
-        policy(late_steps=1).loss(torch.randn(4, 2, 3), torch.zeros(4, 8, 2))
-
-
 def test_a_chunk_begins_at_the_latest_observation():
     p, clean = policy(), torch.arange(16.0).view(1, 8, 2) / 20
     p.unet = Oracle(clean)

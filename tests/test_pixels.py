@@ -267,9 +267,10 @@ def test_renormalising_keeps_the_policy(kind, config):
     windows = rng.normal(3, 2, (7, policy.window, 6)).astype(np.float32)
     policy.reset(0)
     before = policy.act(windows)
-    renormalise(policy, observations)
-    policy.reset(0)
-    np.testing.assert_allclose(policy.act(windows), before, atol=1e-4)
+    for seen in (observations * 0.7 - 1, observations):  # the second time from a scale that was already changed
+        renormalise(policy, seen)
+        policy.reset(0)
+        np.testing.assert_allclose(policy.act(windows), before, atol=1e-4)
     np.testing.assert_allclose(policy.normalizer.mean.numpy(), observations.mean(0), atol=1e-5)
 
 
@@ -298,7 +299,7 @@ def test_what_imitation_leaves(sighted):
 
 
 @pytest.mark.parametrize(("kind", "config", "settings"), [
-    ("mlp", {"hidden": 16}, {}), ("diffusion", SMALL, {"ema_power": 0.75, "iterations": 90})])
+    ("mlp", {"hidden": 16}, {}), ("diffusion", SMALL, {"ema_power": 0.75, "iterations": 90, "eval_every": 30})])
 def test_what_only_pictures_show_is_learned(monkeypatch, kind, config, settings):
     """The lever must be pulled to the side on which the picture is bright; the robot's state is empty."""
 
@@ -314,10 +315,40 @@ def test_what_only_pictures_show_is_learned(monkeypatch, kind, config, settings)
     demos = Demos("lever", "scripted", "test", "-", side.repeat(2, axis=0), side, np.ones(12, bool), np.ones(12, np.int64), np.arange(12))
     view = View("lever", ("front",), 64, 64, False, ((0, 0),), 2)
     pictures = draw(demos, spec=PROBES["lever"], view=view)
-    training = ImitateConfig(**{"iterations": 60, "batch": 16, "lr": 3e-3, "eval_every": 90, "eval_episodes": 8, "bf16": False, **settings})
-    policy, _, history = imitate_pixels(kind, demos, pictures, training, config, spec=PROBES["lever"], view=view)
-    assert policy.normalizer.std[1:].max() > 0.1  # fitted to the features: some of them vary
+    training = ImitateConfig(**{"iterations": 60, "batch": 16, "lr": 3e-3, "eval_every": 60, "eval_episodes": 8, "bf16": False, **settings})
+    policy, encoder, history = imitate_pixels(kind, demos, pictures, training, config, spec=PROBES["lever"], view=view)
+    np.testing.assert_allclose(policy.normalizer.mean.numpy(), encoded(demos, pictures, encoder).observations.mean(0), atol=1e-4)
     assert history[-1]["success_once"] == 1.0, history  # blind, half
+
+
+def test_checkpoints_do_not_change_the_training_of_a_diffusion_policy(painted):
+    """Its loss draws noise; what makes a checkpoint must draw nothing."""
+    demos = reach_demos(4)
+    pictures = draw(demos, spec=PROBES["reach"], view=REACH)
+    often, once = (imitate_pixels("diffusion", demos, pictures, ImitateConfig(iterations=3, batch=4, eval_every=every, eval_episodes=0),
+                                  SMALL | {"window": 2, "horizon": 4, "chunk": 2}, spec=PROBES["reach"], view=REACH)[0] for every in (1, 3))
+    assert all(torch.equal(one, other) for one, other in zip(often.parameters(), once.parameters(), strict=True))
+
+
+def test_a_visual_diffusion_policy_goes_on(painted, tmp_path):
+    """On disk, with a network of its own for the last steps (DPPO), and under the decorator it acts as it did."""
+    demos = reach_demos(4)
+    pictures = draw(demos, spec=PROBES["reach"], view=REACH)
+    config = SMALL | {"window": 2, "horizon": 4, "chunk": 2}
+    policy, encoder, _ = imitate_pixels("diffusion", demos, pictures, ImitateConfig(iterations=2, batch=4, eval_episodes=0), config,
+                                        spec=PROBES["reach"], view=REACH)
+    seen = encoded(demos, pictures, encoder)
+    save_visual(policy, encoder, tmp_path / "v", {"task": "reach"})
+    spec, windows, actions = pixel_spec(PROBES["reach"], encoder_of(tmp_path / "v")), seen.observations[:6].reshape(3, 2, -1), []
+    for each in (policy, load_policy(tmp_path / "v"), policy.with_late(2)):
+        each.reset(0)
+        actions.append(each.act(windows))
+    np.testing.assert_allclose(actions[1:], [actions[0]] * 2, atol=1e-5)
+    values = online_config("StackCube", "smoke", 0, total_steps=120, warmup_steps=40, H=80, num_envs=2, batch=16, utd=0.5, eval_every=120,
+                           eval_episodes=2, log_every=60, checkpoint_every=120, alpha_scale=(), train_limit=0, bf16=False, n_step=2)
+    trainer = Trainer(values, policy, seen, spec=spec)
+    decorated = trainer.train()
+    assert trainer.step >= 120 and decorated.act(windows).shape == (3, 2, 2)
 
 
 def test_a_visual_policy_on_disk(sighted, tmp_path):
@@ -337,7 +368,7 @@ def test_averaged_weights_are_those_of_policy_and_encoder(painted):
     plain, averaged = (imitate_pixels("mlp", demos, pictures, ImitateConfig(iterations=6, batch=8, eval_episodes=0, ema_power=power),
                                       {"hidden": 16}, spec=PROBES["reach"], view=REACH) for power in (0.0, 0.75))
     for one, other in zip(plain[:2], averaged[:2], strict=True):  # policy, encoder
-        assert not torch.equal(next(one.parameters()), next(other.parameters()))
+        assert not torch.equal(list(one.parameters())[-1], list(other.parameters())[-1])  # the first also holds the features' scale
 
 
 # ---- online ----------------------------------------------------------------------------------------------------------
@@ -497,6 +528,8 @@ def test_figures_of_views_and_shifts():
 
 @pytest.mark.parametrize(("words", "message"), [
     (["base", "Door", "--policy", "cnn", "--pixels"], "kinds mlp, bet and diffusion"),
+    (["base", "Door", "--policy", "diffusion", "--pixels", "--set", "own_scale=False"], "Unknown field"),
+    (["base", "Door", "--policy", "diffusion", "--pixels", "--set", "horizon=7"], "multiple of"),
     (["base", "Door", "--policy", "mlp", "--pixels", "--set", "random_shift=-1"], "whole number"),
     (["base", "Door", "--policy", "mlp", "--pixels", "--set", "random_shift=0.5"], "whole number"),
     (["decorated", "Pen", "--pixels", "--base", str(DATA / "checkpoints" / "Door" / "pixels" / "base")], "robot of Door, not of Pen")])

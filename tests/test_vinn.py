@@ -111,6 +111,20 @@ def test_features_of_a_trained_behavior_transformer(tmp_path):
     assert np.allclose(policy.train().act(windows.numpy())[:, 0], actions)  # no dropout, even while something trains
 
 
+def test_film_features_of_a_policy_with_a_scale_of_its_own(tmp_path):
+    """One that was trained from pictures: normaliser and scale together are what its network sees."""
+    demos = reach_demos(6)
+    diffusion = clone(DiffusionPolicy, demos, UNET | {"own_scale": True}, iterations=20)
+    windows = Windows(demos, 2, True).all()[0]
+    with torch.no_grad():
+        wanted = diffusion.film()(torch.nn.functional.mish(diffusion.condition(windows)))
+    diffusion.renormalise(demos.observations * 3 + 1)
+    save_policy(diffusion, tmp_path / "d")
+    policy = VINN({"obs_dim": 4, "act_dim": 2, "representation": str(tmp_path / "d")})
+    with torch.no_grad():
+        assert torch.allclose(policy.features(windows), wanted, atol=1e-3)
+
+
 def test_film_features_are_the_scales_and_shifts_that_the_blocks_get_less_the_steps_part():
     """Watched in the network itself, at two diffusion steps: the same up to a constant, in the order of its blocks."""
     demos = reach_demos(6)

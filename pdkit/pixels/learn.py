@@ -7,6 +7,7 @@ observations through that normaliser.
 from __future__ import annotations
 
 import contextlib
+import copy
 import dataclasses
 import time
 from collections.abc import Callable
@@ -44,8 +45,7 @@ def imitate_pixels(kind: str, demos: Demos, pictures: Pictures, config: ImitateC
     shift = view.shift if shift is None else shift
     torch.manual_seed(config.seed)
     generator = torch.Generator().manual_seed(config.seed)
-    settings = {"own_scale": True} if kind == "diffusion" else {}
-    policy = POLICIES[kind]({"obs_dim": view.state_dim + FEATURES, "act_dim": spec.act_dim, **settings, **(policy_config or {})})
+    policy = POLICIES[kind](visual_settings(kind, view, spec) | (policy_config or {}))
     encoder = Encoder(view)
     state = view.robot(demos.observations)
     unscaled = np.zeros((len(state), FEATURES), np.float32)  # a number that never varies is passed through by the normaliser
@@ -98,17 +98,18 @@ def check_pixels(kind: str, shift: Any) -> None:
         raise PdkitError(f"random_shift counts pixels: it must be a whole number from 0 on, not {shift!r}.")
 
 
+def visual_settings(kind: str, view: View, spec: TaskSpec) -> dict[str, Any]:
+    """The settings of a policy of `kind` that follow from what it sees and does."""
+    own = {"own_scale": True} if kind == "diffusion" else {}
+    return {"obs_dim": view.state_dim + FEATURES, "act_dim": spec.act_dim} | own
+
+
 def _finished(policy: Policy, encoder: Encoder, demos: Demos, pictures: Pictures) -> tuple[Policy, Encoder]:
     """Copies as they will be used: weights rounded to bfloat16, the normaliser fitted to the features."""
-    encoder = rounded(_copy(encoder, Encoder(encoder.view)))
-    policy = _copy(policy, type(policy)(policy.config))
+    encoder, policy = (copy.deepcopy(module).eval() for module in (encoder, policy))  # draws no random number: training goes on with them
+    rounded(encoder)
     renormalise(policy, encoded(demos, pictures, encoder).observations)
     return rounded(policy), encoder.requires_grad_(False)
-
-
-def _copy(module: nn.Module, fresh: nn.Module) -> nn.Module:
-    fresh.load_state_dict(module.state_dict())
-    return fresh.eval()
 
 
 @torch.no_grad()

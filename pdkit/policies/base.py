@@ -57,6 +57,7 @@ class Policy(nn.Module):
     learns = True  # by gradient steps on `loss`; otherwise `remember` is all there is
     defaults: dict[str, Any] = {}  # of its settings; each must be of its default's type
     least: dict[str, float] = {}  # the least values of settings, where not the usual ones (settings.py)
+    made: tuple[str, ...] = ()  # settings that the program makes as it needs them, and nobody gives to a training
 
     def __init__(self, config: dict[str, Any]):
         super().__init__()

@@ -41,6 +41,7 @@ class DiffusionPolicy(Policy):
                                     prediction="epsilon", sampler="ddim", sampler_steps=4, spacing="leading", late_steps=0,
                                     own_scale=False)
     least = dict(embed=4, late_steps=0)
+    made = ("late_steps", "own_scale")  # by DPPO, and by imitation from pictures
     recipe: dict[str, Any] = dict(lr=1e-4, beta1=0.95, weight_decay=1e-6, schedule="cosine", lr_warmup=500, ema_power=0.75)
 
     def __init__(self, config: dict[str, Any]):
@@ -88,8 +89,15 @@ class DiffusionPolicy(Policy):
 
     def condition(self, windows: torch.Tensor) -> torch.Tensor:
         """What the U-Net sees of windows (N, window, obs_dim): (N, window * obs_dim)."""
-        normal = self.normalizer(windows)
-        return (normal if self.scale is None else self.scale(normal)).flatten(1)
+        return self.seen_scale()(windows).flatten(1)
+
+    def seen_scale(self) -> Normalizer:
+        """How the network sees observations: the normaliser, with the network's own scale on top where there is one."""
+        if self.scale is None:
+            return self.normalizer
+        both = Normalizer(self.config["obs_dim"]).to(self.normalizer.mean.device)
+        both.mean, both.std = self.normalizer.mean + self.normalizer.std * self.scale.mean, self.normalizer.std * self.scale.std
+        return both
 
     @torch.no_grad()
     def renormalise(self, observations: np.ndarray) -> None:
@@ -97,10 +105,10 @@ class DiffusionPolicy(Policy):
 
         No layer could take the change in, as an MLP's first does: the condition goes through Mish first.
         """
-        mean, std = self.normalizer.mean.clone(), self.normalizer.std.clone()
+        seen = self.seen_scale()
         self.normalizer.fit(observations)
-        self.scale.mean.copy_((mean - self.normalizer.mean) / self.normalizer.std)
-        self.scale.std.copy_(std / self.normalizer.std)
+        self.scale.mean.copy_((seen.mean - self.normalizer.mean) / self.normalizer.std)
+        self.scale.std.copy_(seen.std / self.normalizer.std)
 
     def film(self) -> nn.Linear:
         """A copy of what turns an activated condition (N, window * obs_dim) into the scales and shifts of all blocks of the U-Net, as far
@@ -108,8 +116,6 @@ class DiffusionPolicy(Policy):
         return self.unet.film(self.config["obs_dim"] * self.window)
 
     def loss(self, windows: torch.Tensor, actions: torch.Tensor) -> dict[str, torch.Tensor]:
-        if self.late is not None:
-            raise PdkitError("Imitation trains one network for all steps; leave late_steps at 0 (DPPO gives the last steps a copy of it).")
         noise = torch.randn(actions.shape).to(actions.device)  # drawn on the CPU everywhere: one generator to restore
         steps = torch.randint(self.config["diffusion_steps"], (len(actions),)).to(actions.device)
         predicted = self.unet(self.noise.add_noise(actions, noise, steps), steps, self.condition(windows))

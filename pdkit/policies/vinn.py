@@ -48,7 +48,8 @@ class VINN(Policy):
         self.gpt: nn.Module | None = trained.gpt if isinstance(trained, BeT) else None
         self.film: nn.Linear | None = trained.film() if isinstance(trained, DiffusionPolicy) else None
         if trained:
-            self.normalizer.load_state_dict(trained.normalizer.state_dict())
+            seen = trained.seen_scale() if isinstance(trained, DiffusionPolicy) else trained.normalizer
+            self.normalizer.load_state_dict(seen.state_dict())
         self.looks = trained.window if trained else 1  # observations that make one feature
         self.window = self.looks + (c["history"] if c["exclusion"] else 0)
         self.feature_dim = self.film.out_features if self.film else trained.config["features"] if trained else c["obs_dim"]
