@@ -322,10 +322,10 @@ def test_the_critics_architecture(results, mlp, others, ppo, expected):
     assert [verdicts.find(claim) is None for claim in claims_of] == [False, True, True]
 
 
-def calql_results(results, ends, curves, minutes=None):
-    """`ends`: recipe -> mean final success; `curves`: recipe -> success at each online evaluation."""
+def calql_results(results, ends, curves, minutes=None, load=2.0):
+    """`ends`: recipe -> mean final success; `curves`: recipe -> success at each online evaluation; `load` on 2 cores."""
     spread = 0.02 * np.array([-1, 1, 0])
-    tables = {r: runs(r, end + spread, train_minutes=(minutes or {}).get(r, 5.0)) for r, end in ends.items()}
+    tables = {r: runs(r, end + spread, train_minutes=(minutes or {}).get(r, 5.0), load_average=load, cores=2) for r, end in ends.items()}
     noise = {r: spread * (-1 if r == "calql_a" else 1) for r in curves}  # or else it would cancel seed by seed
     lines = pd.concat([curve(r, first + noise[r], last + noise[r]) for r, (first, last) in curves.items()])
     offline = lines.groupby(["recipe", "seed"], as_index=False).first().assign(step=0, success_once=1.0)  # must not count
@@ -349,15 +349,16 @@ def test_negative_data_and_sac_online(results, a, b, c, negative, online):
 def test_what_cal_ql_saves_and_what_its_actor_is(results):
     starts = ("A critic pre-trained by Cal-QL", "SAC in place of Cal-QL online saves", "A large GPT actor", "A pre-trained BeT actor")
 
-    def verdicts_of(e, tuned, c, d, slower):
+    def verdicts_of(e, tuned, c, d, slower, load=2.0):
         calql_results(results, {"calql": e, "sac_finetune": tuned, "calql_b": 0.5, "calql_c": c, "calql_d": d}, {"calql_b": (0.1, 0.2)},
-                      {"calql_b": 5.0 * slower})
+                      {"calql_b": 5.0 * slower}, load)
         return [verdicts.find(claim) for claim in starting(*starts)]
 
     found = verdicts_of(e=0.4, tuned=0.4, c=0.9, d=0.2, slower=2.0)
     assert [f.verdict for f in found] == ["reproduced"] * 4 and "2.00 times" in found[1].measured
     assert found[3].command.count("data/sweeps/") == 2 and found[0].command == "pdkit sweep data/sweeps/leaderboard.toml"
     assert [f.verdict for f in verdicts_of(e=0.6, tuned=0.4, c=0.2, d=0.9, slower=1.1)] == ["not"] * 4
+    assert [f and f.verdict for f in verdicts_of(e=0.6, tuned=0.4, c=0.2, d=0.9, slower=1.1, load=4.0)] == ["not", None, "not", "not"]
 
 
 def test_what_a_lesson_cannot_reach_stays_untested():
