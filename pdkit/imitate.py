@@ -101,21 +101,27 @@ class Windows:
 
 
 class Average:
-    """The exponentially averaged weights of what is in training (diffusers' EMAModel, whose decay rises with the steps)."""
+    """The exponentially averaged weights of what is in training (diffusers' EMAModel, whose decay rises with the steps); with a power of 0
+    there is no average, and the weights are always those of training."""
 
     def __init__(self, parameters: Iterable[nn.Parameter], power: float):
-        from diffusers.training_utils import EMAModel
+        self._parameters, self._ema = list(parameters), None
+        if power:
+            from diffusers.training_utils import EMAModel  # takes seconds to load
 
-        self._parameters = list(parameters)
-        self._ema = EMAModel(self._parameters, use_ema_warmup=True, power=power)
+            self._ema = EMAModel(self._parameters, use_ema_warmup=True, power=power)
 
     def step(self) -> None:
         """Take in the weights as they are after a gradient step."""
-        self._ema.step(self._parameters)
+        if self._ema:
+            self._ema.step(self._parameters)
 
     @contextlib.contextmanager
     def in_place(self) -> Iterator[None]:
         """Within this block they have the averaged weights."""
+        if not self._ema:
+            yield
+            return
         self._ema.store(self._parameters)
         self._ema.copy_to(self._parameters)
         try:
@@ -180,18 +186,17 @@ def imitate(kind: str, demos: Demos, config: ImitateConfig | None = None, policy
         return policy.eval(), [row]
     optimizer = make_optimizer(policy, config)
     rates = torch.optim.lr_scheduler.LambdaLR(optimizer, config.lr_factor)
-    average = Average(policy.parameters(), config.ema_power) if config.ema_power else None
+    average = Average(policy.parameters(), config.ema_power)
     history, best, best_state, started = [], -1.0, None, time.monotonic()
     for iteration in range(1, config.iterations + 1):
         terms = gradient_step(policy, optimizer, *(x.to(device) for x in windows.sample(config.batch, generator)), config.bf16)
         rates.step()
-        if average:
-            average.step()
+        average.step()
         if iteration % config.eval_every and iteration < config.iterations:
             continue
         row = checkpoint_row(iteration, started, terms, config.lr)
         score = float(iteration)  # without evaluations the latest wins
-        with average.in_place() if average else contextlib.nullcontext():
+        with average.in_place():
             if config.eval_episodes:
                 row |= selection_scores(spec, policy.eval(), config)
                 score = row["success_once"]

@@ -89,6 +89,11 @@ def test_sampling_removes_the_noise_that_the_network_tells(sampler, steps, asked
     assert torch.allclose(actions, clean, atol=1e-3) and p.unet.asked == asked
 
 
+def test_no_more_steps_have_a_network_of_their_own_than_there_are():
+    with pytest.raises(PdkitError, match="from 0 to all 4"):
+        policy(late_steps=9)
+
+
 def test_a_chunk_begins_at_the_latest_observation():
     p, clean = policy(), torch.arange(16.0).view(1, 8, 2) / 20
     p.unet = Oracle(clean)

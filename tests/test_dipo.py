@@ -284,5 +284,5 @@ def test_the_command_line_refuses_another_base_policy_in_one_sentence(monkeypatc
     words = ["train", "decorated", "Door", "--method", "dipo", "--base", str(base), "--out", str(tmp_path)]
     monkeypatch.setattr(sys, "argv", ["pdkit", *words])
     assert cli.main(words) == 2
-    assert "train one with `pdkit train base TASK --policy diffusion`" in capsys.readouterr().err
+    assert capsys.readouterr().err.strip().endswith("train one with `pdkit train base TASK --policy diffusion`.")
     assert not list(tmp_path.iterdir())  # no folder of a run that could not begin, in the way of the next

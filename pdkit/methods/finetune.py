@@ -30,7 +30,7 @@ class FineTune(Trainer):
         kind = self.starts_from.kind
         if not isinstance(base, self.starts_from):
             raise PdkitError(f"{config.method} fine-tunes a base policy of kind {kind}, not {base.kind}: train one with "
-                             f"`pdkit train base TASK --policy {kind}` (one that sees: with --pixels).")
+                             f"`pdkit train base TASK --policy {kind}`.")
         self._start_policy = base
         super().__init__(config, Zero.instead_of(base, base.window, base.chunk), demos, spec)
 

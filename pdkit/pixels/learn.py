@@ -6,7 +6,6 @@ observations through that normaliser.
 """
 from __future__ import annotations
 
-import contextlib
 import copy
 import dataclasses
 import time
@@ -58,7 +57,7 @@ def imitate_pixels(kind: str, demos: Demos, pictures: Pictures, config: ImitateC
     rgb, depth = torch.from_numpy(pictures.rgb), torch.from_numpy(pictures.depth.astype(np.int32))
     optimizer = make_optimizer(policy, config, [{"params": list(encoder.parameters()), "weight_decay": config.weight_decay}])
     rates = torch.optim.lr_scheduler.LambdaLR(optimizer, config.lr_factor)
-    average = Average([*policy.parameters(), *encoder.parameters()], config.ema_power) if config.ema_power else None
+    average = Average([*policy.parameters(), *encoder.parameters()], config.ema_power)
 
     def loss() -> dict[str, torch.Tensor]:
         observations, actions = windows.sample(config.batch, generator)
@@ -73,12 +72,11 @@ def imitate_pixels(kind: str, demos: Demos, pictures: Pictures, config: ImitateC
     for iteration in range(1, config.iterations + 1):
         terms = minimise(loss, optimizer, "cpu", config.bf16)
         rates.step()
-        if average:
-            average.step()
+        average.step()
         if iteration % config.eval_every and iteration < config.iterations:
             continue
         row = checkpoint_row(iteration, started, terms, config.lr)
-        with average.in_place() if average else contextlib.nullcontext():
+        with average.in_place():
             candidate = _finished(policy, encoder, demos, pictures)
         row |= selection_scores(pixel_spec(spec, candidate[1]), candidate[0], config)
         score = row.get("success_once", float(iteration))  # without evaluations the latest wins
