@@ -22,7 +22,8 @@ from scipy import stats as scipy_stats
 from .demos.format import Demos
 from .errors import PdkitError
 from .evaluate import evaluate
-from .imitate import ImitateConfig, Windows, gradient_step, imitate, make_optimizer
+from .gradient_steps import gradient_step, make_optimizer
+from .imitate import ImitateConfig, Windows, imitate
 from .policies import POLICIES, Policy
 from .tasks.spec import TaskSpec
 
@@ -70,7 +71,8 @@ def costs(families: Mapping[str, Family], demos: Demos, spec: TaskSpec, *, lanes
     for name, family in families.items():
         policy, config = fresh(family, demos, spec), family.settings(1, 0)
         batch = Windows(demos, policy.window, True, policy.horizon, spec.resting).sample(config.batch, torch.Generator().manual_seed(0))
-        learning = _milliseconds(partial(gradient_step, policy.train(), make_optimizer(policy, config), *batch, config.bf16), repeats)
+        optimizer = make_optimizer(policy.train(), config)
+        learning = _milliseconds(partial(gradient_step, policy.loss, optimizer, "cpu", config.bf16, *batch), repeats)
         acting = _milliseconds(partial(policy.eval().act, np.zeros((lanes, policy.window, spec.obs_dim), np.float32)), repeats)
         rows.append({"family": name, "parameters": sum(p.numel() for p in policy.parameters()), "window": policy.window,
                      "chunk": policy.chunk, "batch": config.batch, "ms_gradient_step": learning,

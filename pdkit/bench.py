@@ -8,6 +8,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,8 @@ from .decorator import DecoratorConfig, critic_features
 from .demos import Demos
 from .demos.sources import bundled
 from .files import DATA, write_json
-from .imitate import ImitateConfig, Windows, gradient_step, make_optimizer
+from .gradient_steps import GradientSteps, gradient_step, make_optimizer
+from .imitate import ImitateConfig, Windows
 from .policies import POLICIES
 from .profiles import online_config
 from .rl.replay import Replay
@@ -190,12 +192,17 @@ def imitator(kind: str, demos: Demos, batch: int, device: str, shipped: bool) ->
     policy = POLICIES[kind](dict(obs_dim=spec.obs_dim, act_dim=spec.act_dim, **POLICIES[kind].for_task(spec)))
     policy.fit_statistics(demos.observations, demos.actions)
     policy.to(device).train()
-    groups = policy.parameter_groups(config.weight_decay)
-    optimizer = make_optimizer(policy, config) if shipped else torch.optim.AdamW(groups, lr=config.lr, foreach=False)
     windows, generator = Windows(demos, policy.window, True, policy.horizon, spec.resting), torch.Generator().manual_seed(0)
+    if shipped:
+        step = GradientSteps(policy.loss, make_optimizer(policy, config, device=device), device, bf16=True)
+        windows.to(device)
+    else:
+        plain = torch.optim.AdamW(policy.parameter_groups(config.weight_decay), lr=config.lr, foreach=False)
+        step = partial(gradient_step, policy.loss, plain, device, False)
 
     def work() -> int:
-        gradient_step(policy, optimizer, *(x.to(device) for x in windows.sample(batch, generator)), shipped)
+        observations, actions = windows.sample(batch, generator)
+        step(*(x.to(device) for x in (observations, actions, *policy.draw(actions.shape))))
         if device == "cuda":
             torch.cuda.synchronize()
         return 1

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,11 +16,11 @@ from torch import nn
 from .demos.format import Demos
 from .errors import PdkitError, unknown
 from .evaluate import evaluate
+from .gradient_steps import GradientSteps, make_optimizer
 from .policies import POLICIES, Policy
 from .seeds import selection_seeds
 from .tasks import get_task
 from .tasks.spec import TaskSpec
-from .torch_setup import autocast
 
 SCHEDULES = ("constant", "cosine")
 
@@ -89,6 +89,12 @@ class Windows:
         self.index = torch.tensor(np.array(index))
         self.span, self.ahead = torch.arange(window), torch.arange(horizon or window)
 
+    def to(self, device: str) -> Windows:
+        """Keep them on `device`; where batches are drawn stays the business of the generator given to `sample`, on the CPU."""
+        for name in ("observations", "actions", "index", "span", "ahead"):
+            setattr(self, name, getattr(self, name).to(device))
+        return self
+
     def all(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Every window (N, window, obs_dim), and the action (N, act_dim) taken at its last observation."""
         rows = self.index[:, None] + self.span
@@ -96,7 +102,8 @@ class Windows:
 
     def sample(self, batch: int, generator: torch.Generator) -> tuple[torch.Tensor, torch.Tensor]:
         """(B, window, obs_dim) and (B, horizon, act_dim)."""
-        start = self.index[torch.randint(len(self.index), (batch,), generator=generator)][:, None]
+        drawn = torch.randint(len(self.index), (batch,), generator=generator)
+        start = self.index[drawn.to(self.index.device)][:, None]
         return self.observations[start + self.span], self.actions[start + self.ahead]
 
 
@@ -109,7 +116,7 @@ class Average:
         if power:
             from diffusers.training_utils import EMAModel  # takes seconds to load
 
-            self._ema = EMAModel(self._parameters, use_ema_warmup=True, power=power)
+            self._ema = EMAModel(self._parameters, use_ema_warmup=True, power=power, foreach=True)
 
     def step(self) -> None:
         """Take in the weights as they are after a gradient step."""
@@ -128,29 +135,6 @@ class Average:
             yield
         finally:
             self._ema.restore(self._parameters)
-
-
-def make_optimizer(policy: Policy, config: ImitateConfig, others: Sequence[dict[str, Any]] = ()) -> torch.optim.AdamW:
-    """AdamW over the policy's parameter groups and `others`, as one kernel for all of them."""
-    groups = [*policy.parameter_groups(config.weight_decay), *others]
-    return torch.optim.AdamW(groups, lr=config.lr, betas=(config.beta1, 0.999), fused=True)
-
-
-def minimise(loss: Callable[[], dict[str, torch.Tensor]], optimizer: torch.optim.Optimizer, device: str, bf16: bool
-             ) -> dict[str, torch.Tensor]:
-    """One step down the `loss` among the terms that a call gives; the terms."""
-    with autocast(device, bf16):
-        terms = loss()
-    optimizer.zero_grad(set_to_none=True)
-    terms["loss"].backward()
-    optimizer.step()
-    return terms
-
-
-def gradient_step(policy: Policy, optimizer: torch.optim.Optimizer, observations: torch.Tensor, actions: torch.Tensor, bf16: bool
-                  ) -> dict[str, torch.Tensor]:
-    """One step on windows (B, window, obs_dim) and actions (B, horizon or window, act_dim); the loss terms."""
-    return minimise(lambda: policy.loss(observations, actions), optimizer, observations.device.type, bf16)
 
 
 def checkpoint_row(iteration: int, started: float, terms: dict[str, torch.Tensor], lr: float) -> dict[str, float]:
@@ -184,12 +168,15 @@ def imitate(kind: str, demos: Demos, config: ImitateConfig | None = None, policy
         if progress:
             progress(row)
         return policy.eval(), [row]
-    optimizer = make_optimizer(policy, config)
+    optimizer = make_optimizer(policy, config, device=device)
+    step = GradientSteps(policy.loss, optimizer, device, config.bf16)
+    windows.to(device)
     rates = torch.optim.lr_scheduler.LambdaLR(optimizer, config.lr_factor)
     average = Average(policy.parameters(), config.ema_power)
     history, best, best_state, started = [], -1.0, None, time.monotonic()
     for iteration in range(1, config.iterations + 1):
-        terms = gradient_step(policy, optimizer, *(x.to(device) for x in windows.sample(config.batch, generator)), config.bf16)
+        observations, actions = windows.sample(config.batch, generator)
+        terms = step(observations, actions, *(x.to(device) for x in policy.draw(actions.shape)))
         rates.step()
         average.step()
         if iteration % config.eval_every and iteration < config.iterations:

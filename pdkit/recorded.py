@@ -7,13 +7,14 @@ import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import matplotlib.pyplot as plt
 import pandas as pd
 from matplotlib.figure import Figure
 
 from .errors import PdkitError
-from .files import DATA, atomic_file, write_json
+from .files import DATA, atomic_file, read_json, write_json
 from .runs import describe_machine
 from .stats import wilson
 
@@ -23,7 +24,8 @@ KEYS = ["task", "recipe", "seed"]  # a row with the same ones is replaced
 def record(name: str, rows: pd.DataFrame, curves: pd.DataFrame) -> None:
     """Add rows to data/results/NAME.csv and, where there are curves, NAME_curves.csv, and draw NAME.png of trainings anew.
 
-    The manifest tells how to make all of it again: the column `sweep` of rows that have one, else `command`.
+    The manifest tells how to make all of it again (the column `sweep` of rows that have one, else `command`) and on what it was made:
+    this machine last, before it those of earlier rows.
     """
     folder, tables = DATA / "results", []
     with _alone(name):
@@ -34,8 +36,8 @@ def record(name: str, rows: pd.DataFrame, curves: pd.DataFrame) -> None:
             with atomic_file(path) as temporary:
                 tables[-1].to_csv(temporary, index=False, float_format="%.6g")
         again = tables[0]["sweep"].fillna(tables[0].command) if "sweep" in tables[0] else tables[0].command
-        write_json(folder / f"{name}_manifest.json", {"written": time.strftime("%Y-%m-%d"), "machine": describe_machine(),
-                                                     "again": sorted(set(again))})
+        path = folder / f"{name}_manifest.json"
+        write_json(path, {"written": time.strftime("%Y-%m-%d"), "machines": _machines(path), "again": sorted(set(again))})
         if len(tables) < 2 or not {"base_success", "decorated_success"} <= set(tables[0]):
             return
         with atomic_file(folder / f"{name}.png") as temporary:
@@ -68,6 +70,13 @@ def by_arm(table: pd.DataFrame, group: str, field: str, name: str) -> pd.DataFra
         raise PdkitError(f"These results have no columns {group}.ARM.{field}; they come from another notebook.")
     rows = table.set_index("seed")[list(arms)].rename(columns=arms).stack()
     return rows.rename_axis(["seed", "recipe"]).rename(name).reset_index()[["recipe", "seed", name]]
+
+
+def _machines(path: Path) -> list[dict[str, Any]]:
+    """The machines of a manifest and this one, last; of the same machine only the newest commit."""
+    this, old = describe_machine(), read_json(path) if path.exists() else {}
+    earlier = old.get("machines") or [old[key] for key in ("machine",) if key in old]
+    return [machine for machine in earlier if machine | {"git": ""} != this | {"git": ""}] + [this]
 
 
 @contextlib.contextmanager

@@ -41,7 +41,7 @@ from .seeds import reported_seeds
 from .tasks import get_task
 from .tasks.spec import TaskSpec
 from .tensorboard import Board
-from .torch_setup import set_threads
+from .torch_setup import pick_device, set_threads
 
 
 def main(argv: list[str]) -> int:
@@ -54,6 +54,7 @@ def main(argv: list[str]) -> int:
     base.add_argument("--num-demos", type=int, help="use only the first so many")
     base.add_argument("--out", help="folder of the checkpoint (default runs/base/TASK-POLICY)")
     base.add_argument("--pixels", action="store_true", help="see pictures instead of the object's state: train an encoder with the policy")
+    base.add_argument("--device", default="auto", help="where it is trained: auto (CUDA where there is one), cpu or cuda")
     decorated = kinds.add_parser("decorated", help="improve a base policy by online RL on sparse reward, by any of the methods")
     decorated.add_argument("task")
     decorated.add_argument("--profile", default="lesson", help=f"one of: {', '.join(PROFILES)}")
@@ -110,8 +111,9 @@ def _base(args) -> int:
         if name not in fields | given:
             raise unknown("field", name, fields | given)
     config = checked(ImitateConfig, POLICIES[args.policy].recipe | {k: v for k, v in settings.items() if k in fields})
+    device = pick_device(args.device)
     out = Path(args.out) if args.out else runs_root() / "base" / f"{args.task}-{args.policy}{'-pixels' if args.pixels else ''}"
-    print(f"{args.policy} on {demos.num} demonstrations of {args.task} ({demos.label}): {config}", flush=True)
+    print(f"{args.policy} on {demos.num} demonstrations of {args.task} ({demos.label}), on {device}: {config}", flush=True)
 
     def show(row: dict[str, float]) -> None:
         print("  " + ", ".join(f"{k} {v:.3g}" for k, v in row.items()), flush=True)
@@ -120,9 +122,10 @@ def _base(args) -> int:
         # Wrong settings are refused before anything is drawn.
         POLICIES[args.policy](visual_settings(args.policy, view_of(args.task), get_task(args.task)) | architecture)
         pictures = pictures_of(demos, Progress(demos.num, "drawn"))
-        policy, encoder, history = imitate_pixels(args.policy, demos, pictures, config, architecture, shift=shift, progress=show)
+        policy, encoder, history = imitate_pixels(args.policy, demos, pictures, config, architecture, shift=shift, device=device,
+                                                  progress=show)
     else:
-        policy, history = imitate(args.policy, demos, config, architecture, progress=show)
+        policy, history = imitate(args.policy, demos, config, architecture, device=device, progress=show)
     best = max(history, key=lambda row: row.get("success_once", row["iteration"]))
     info = {"task": args.task, "demos": demos.num, "demos_checksum": demos.checksum, "label": demos.label, "imitate": asdict(config),
             "selected": best, "command": "pdkit train " + " ".join(sys.argv[2:]), "machine": describe_machine()}

@@ -8,7 +8,8 @@ import torch
 from pdkit.bench import EagerSAC, imitator, paired, updater
 from pdkit.decorator import DecoratorConfig
 from pdkit.demos.sources import bundled
-from pdkit.imitate import ImitateConfig, Windows, gradient_step, make_optimizer
+from pdkit.gradient_steps import gradient_step, make_optimizer
+from pdkit.imitate import ImitateConfig, Windows
 from pdkit.policies import MLP
 from pdkit.rl.sac import SAC, SACConfig
 
@@ -52,7 +53,7 @@ def test_imitation_is_timed_with_the_same_gradient_step_on_both_sides():
             torch.optim.AdamW(groups, lr=ImitateConfig().lr, foreach=False)
         windows = Windows(demos, 1, True)
         before = torch.nn.utils.parameters_to_vector(policy.parameters()).detach().clone()
-        gradient_step(policy, optimizer, *windows.sample(batch, torch.Generator().manual_seed(1)), bf16=False)
+        gradient_step(policy.loss, optimizer, "cpu", False, *windows.sample(batch, torch.Generator().manual_seed(1)))
         ends.append(torch.nn.utils.parameters_to_vector(policy.parameters()).detach())
         assert not torch.equal(ends[-1], before)
     assert torch.allclose(*ends, atol=1e-6)

@@ -83,9 +83,10 @@ def random_shift(pictures: torch.Tensor, pad: int, generator: torch.Generator) -
     batch, _, height, width = pictures.shape
     if height != width:
         raise PdkitError(f"Random shift is for square pictures, not {height} x {width}; set random_shift=0.")
-    moves = torch.randint(-pad, pad + 1, (batch, 2, 1), generator=generator)
-    rows, columns = ((torch.arange(height) + moves[:, axis]).clamp(0, height - 1) for axis in (0, 1))
-    return pictures[torch.arange(batch)[:, None, None], :, rows[:, :, None], columns[:, None, :]].permute(0, 3, 1, 2)
+    moves = torch.randint(-pad, pad + 1, (batch, 2, 1), generator=generator).to(pictures.device)
+    along, each = (torch.arange(count, device=pictures.device) for count in (height, batch))
+    rows, columns = ((along + moves[:, axis]).clamp(0, height - 1) for axis in (0, 1))
+    return pictures[each[:, None, None], :, rows[:, :, None], columns[:, None, :]].permute(0, 3, 1, 2)
 
 
 def save_encoder(encoder: Encoder, folder: str | Path, info: dict[str, Any] | None = None) -> None:

@@ -18,7 +18,8 @@ from torch import nn
 
 from ..demos.format import Demos
 from ..errors import PdkitError
-from ..imitate import Average, ImitateConfig, Windows, checkpoint_row, make_optimizer, minimise, selection_scores
+from ..gradient_steps import GradientSteps, make_optimizer
+from ..imitate import Average, ImitateConfig, Windows, checkpoint_row, selection_scores
 from ..policies import MLP, POLICIES, BeT, DiffusionPolicy, Policy
 from ..tasks import get_task
 from ..tasks.spec import TaskSpec
@@ -31,13 +32,13 @@ HEADS = ("mlp", "bet", "diffusion")
 
 
 def imitate_pixels(kind: str, demos: Demos, pictures: Pictures, config: ImitateConfig, policy_config: dict | None = None, *,
-                   shift: int | None = None, progress: Callable[[dict], None] | None = None, spec: TaskSpec | None = None,
-                   view: View | None = None) -> tuple[Policy, Encoder, list[dict]]:
+                   shift: int | None = None, device: str = "cpu", progress: Callable[[dict], None] | None = None,
+                   spec: TaskSpec | None = None, view: View | None = None) -> tuple[Policy, Encoder, list[dict]]:
     """Train an encoder and a policy of `kind` on demonstrations and their pictures.
 
     `shift` is the random shift in pixels (the view's, if not given); `spec` and `view` are for worlds outside the registry.
-    Returns the selected policy and encoder, in evaluation mode and with weights rounded to bfloat16 (as they are shipped), and one row
-    a checkpoint as `imitate` does. Raises PdkitError for a kind of policy that is not one of HEADS, or a loss that is no number.
+    Returns the selected policy and encoder, on the CPU, in evaluation mode and with weights rounded to bfloat16 (as they are shipped),
+    and one row a checkpoint as `imitate` does. Raises PdkitError for a kind of policy that is not one of HEADS, or a loss that is no number.
     """
     check_pixels(kind, shift)
     view, spec = view or view_of(demos.task), spec or get_task(demos.task)
@@ -49,28 +50,33 @@ def imitate_pixels(kind: str, demos: Demos, pictures: Pictures, config: ImitateC
     state = view.robot(demos.observations)
     unscaled = np.zeros((len(state), FEATURES), np.float32)  # a number that never varies is passed through by the normaliser
     policy.fit_statistics(np.concatenate([state, unscaled], axis=1), demos.actions, config.seed)
-    policy.train()
+    policy.to(device).train()
+    encoder.to(device)
     # A window of observations is told by the number of each frame, and the robot's state then.
     numbered = np.concatenate([np.arange(len(state), dtype=np.float32)[:, None], state], axis=1)
     windows = Windows(dataclasses.replace(demos, observations=numbered), policy.window, config.pad_start, policy.horizon, spec.resting,
-                      config.hold_end)
-    rgb, depth = torch.from_numpy(pictures.rgb), torch.from_numpy(pictures.depth.astype(np.int32))
-    optimizer = make_optimizer(policy, config, [{"params": list(encoder.parameters()), "weight_decay": config.weight_decay}])
+                      config.hold_end).to(device)
+    rgb, depth = (torch.from_numpy(x).to(device) for x in (pictures.rgb, pictures.depth.astype(np.int32)))
+    optimizer = make_optimizer(policy, config, [{"params": list(encoder.parameters()), "weight_decay": config.weight_decay}], device)
     rates = torch.optim.lr_scheduler.LambdaLR(optimizer, config.lr_factor)
     average = Average([*policy.parameters(), *encoder.parameters()], config.ema_power)
 
-    def loss() -> dict[str, torch.Tensor]:
+    def batch() -> tuple[torch.Tensor, ...]:
         observations, actions = windows.sample(config.batch, generator)
         frames = observations[..., 0].long().flatten()
         seen = torch.cat([rgb[frames].int(), depth[frames]], dim=1)
         if shift:
             seen = random_shift(seen, shift, generator)
-        features = encoder(*seen.split([rgb.shape[1], depth.shape[1]], dim=1)).unflatten(0, observations.shape[:2])
-        return policy.loss(torch.cat([observations[..., 1:], features.float()], dim=-1), actions)
+        return seen, observations[..., 1:], actions, *(x.to(device) for x in policy.draw(actions.shape))
 
+    def loss(seen: torch.Tensor, state: torch.Tensor, actions: torch.Tensor, *drawn: torch.Tensor) -> dict[str, torch.Tensor]:
+        features = encoder(*seen.split([rgb.shape[1], depth.shape[1]], dim=1)).unflatten(0, state.shape[:2])
+        return policy.loss(torch.cat([state, features.float()], dim=-1), actions, *drawn)
+
+    step = GradientSteps(loss, optimizer, device, config.bf16)
     history, best, chosen, started = [], -1.0, None, time.monotonic()
     for iteration in range(1, config.iterations + 1):
-        terms = minimise(loss, optimizer, "cpu", config.bf16)
+        terms = step(*batch())
         rates.step()
         average.step()
         if iteration % config.eval_every and iteration < config.iterations:
@@ -104,7 +110,7 @@ def visual_settings(kind: str, view: View, spec: TaskSpec) -> dict[str, Any]:
 
 def _finished(policy: Policy, encoder: Encoder, demos: Demos, pictures: Pictures) -> tuple[Policy, Encoder]:
     """Copies as they will be used: weights rounded to bfloat16, the normaliser fitted to the features."""
-    encoder, policy = (copy.deepcopy(module).eval() for module in (encoder, policy))  # draws no random number: training goes on with them
+    encoder, policy = (copy.deepcopy(module).cpu().eval() for module in (encoder, policy))  # draws no random number: training goes on with them
     rounded(encoder)
     renormalise(policy, encoded(demos, pictures, encoder).observations)
     return rounded(policy), encoder.requires_grad_(False)

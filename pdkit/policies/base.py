@@ -86,9 +86,14 @@ class Policy(nn.Module):
         """Parameter groups for AdamW."""
         raise NotImplementedError
 
-    def loss(self, windows: torch.Tensor, actions: torch.Tensor) -> dict[str, torch.Tensor]:
+    def draw(self, shape: torch.Size) -> tuple[torch.Tensor, ...]:
+        """The random numbers that `loss` takes besides, for actions of that shape: drawn on the CPU whatever the device, so that there is
+        one generator to restore."""
+        return ()
+
+    def loss(self, windows: torch.Tensor, actions: torch.Tensor, *drawn: torch.Tensor) -> dict[str, torch.Tensor]:
         """Imitation loss for windows (B, window, obs_dim) and the actions from the first position on (B, horizon or window, act_dim);
-        a dict of scalars of which `loss` is minimised."""
+        a dict of scalars of which `loss` is minimised. `drawn` is what `draw` gives, or drawn now."""
         raise NotImplementedError
 
     def forward(self, windows: torch.Tensor) -> torch.Tensor:

@@ -115,9 +115,12 @@ class DiffusionPolicy(Policy):
         as they depend on the observations: what the diffusion step adds is the same for all."""
         return self.unet.film(self.config["obs_dim"] * self.window)
 
-    def loss(self, windows: torch.Tensor, actions: torch.Tensor) -> dict[str, torch.Tensor]:
-        noise = torch.randn(actions.shape).to(actions.device)  # drawn on the CPU everywhere: one generator to restore
-        steps = torch.randint(self.config["diffusion_steps"], (len(actions),)).to(actions.device)
+    def draw(self, shape: torch.Size) -> tuple[torch.Tensor, ...]:
+        """Noise for the actions, and how many steps each sequence is noised by (B,)."""
+        return torch.randn(shape), torch.randint(self.config["diffusion_steps"], (shape[0],))
+
+    def loss(self, windows: torch.Tensor, actions: torch.Tensor, *drawn: torch.Tensor) -> dict[str, torch.Tensor]:
+        noise, steps = drawn or (x.to(actions.device) for x in self.draw(actions.shape))
         predicted = self.unet(self.noise.add_noise(actions, noise, steps), steps, self.condition(windows))
         wanted = noise if self.config["prediction"] == "epsilon" else self.noise.get_velocity(actions, noise, steps)
         return {"loss": F.mse_loss(predicted.float(), wanted)}

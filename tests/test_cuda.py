@@ -1,0 +1,89 @@
+"""What only a GPU can show: imitation by recorded steps gives what plain ones give, and online RL learns there. Skipped without one."""
+import numpy as np
+import pytest
+import torch
+
+from pdkit.evaluate import evaluate
+from pdkit.gradient_steps import GradientSteps, gradient_step, make_optimizer
+from pdkit.imitate import ImitateConfig, Windows, imitate
+from pdkit.pixels.encoders import random_shift
+from pdkit.policies import POLICIES, load_policy, save_policy
+from pdkit.probes import PROBES
+from worlds import reach_demos, reach_trainer
+
+pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no CUDA device")
+
+SMALL = {"mlp": dict(hidden=32), "bet": dict(window=4, layers=1, heads=2, embed=16, features=16, dropout=0.0),
+         "diffusion": dict(dims=[16, 32], groups=4, embed=16), "rnn": dict(hidden=16), "cnn": dict(hidden=16, layers=1)}
+
+
+def trained(kind, recorded, iterations=12):
+    """Weights after some steps with a falling learning rate, all from the same start."""
+    demos, config = reach_demos(8), ImitateConfig(iterations=iterations, schedule="cosine", bf16=False)
+    torch.manual_seed(0)
+    policy = POLICIES[kind](dict(obs_dim=4, act_dim=2) | SMALL[kind])
+    policy.fit_statistics(demos.observations, demos.actions)
+    policy.to("cuda").train()
+    optimizer, windows = make_optimizer(policy, config, device="cuda"), Windows(demos, policy.window, True, policy.horizon).to("cuda")
+    rates, generator = torch.optim.lr_scheduler.LambdaLR(optimizer, config.lr_factor), torch.Generator().manual_seed(1)
+    step = GradientSteps(policy.loss, optimizer, "cuda", False)
+    losses = []
+    for _ in range(iterations):
+        observations, actions = windows.sample(32, generator)
+        batch = (observations, actions, *(x.to("cuda") for x in policy.draw(actions.shape)))
+        terms = step(*batch) if recorded else gradient_step(policy.loss, optimizer, "cuda", False, *batch)
+        losses.append(float(terms["loss"]))
+        rates.step()
+    return torch.nn.utils.parameters_to_vector(policy.parameters()).detach().cpu(), losses
+
+
+@pytest.mark.parametrize("kind", SMALL)
+def test_recorded_steps_train_as_plain_ones_do(kind):
+    (weights, losses), (plain, plain_losses) = trained(kind, True), trained(kind, False)
+    assert losses == pytest.approx(plain_losses, rel=1e-3, abs=1e-5) and len(set(losses)) == len(losses)
+    assert torch.allclose(weights, plain, atol=2e-4)
+
+
+def test_a_recorded_step_follows_the_learning_rate():
+    weight = torch.nn.Parameter(torch.zeros(1, device="cuda"))
+    lr = torch.tensor(1.0, device="cuda")
+    optimizer = torch.optim.SGD([weight], lr=lr)
+    step = GradientSteps(lambda x: {"loss": (weight * x).sum()}, optimizer, "cuda", False)
+    moves = []
+    for factor in (1, 1, 1, 1, 2, 3):  # three steps as written, then replays
+        lr.fill_(factor)
+        before = weight.item()
+        step(torch.ones(1, device="cuda"))
+        moves.append(before - weight.item())
+    assert moves == [1, 1, 1, 1, 2, 3]
+
+
+def test_imitation_on_the_gpu_learns_the_probe_and_its_checkpoint_loads_on_the_cpu(tmp_path):
+    config = ImitateConfig(iterations=400, batch=64, lr=3e-3, eval_every=200, eval_episodes=10, ema_power=0.75)
+    policy, history = imitate("mlp", reach_demos(), config, SMALL["mlp"], device="cuda", spec=PROBES["reach"])
+    assert next(policy.parameters()).is_cuda and max(row["success_once"] for row in history) > 0.8
+    save_policy(policy, tmp_path / "it")
+    loaded, windows = load_policy(tmp_path / "it"), np.random.default_rng(0).normal(size=(5, 1, 4)).astype(np.float32)
+    np.testing.assert_allclose(loaded.act(windows), policy.act(windows), atol=1e-5)
+
+
+def test_random_shift_is_the_same_on_both_devices():
+    pictures = torch.arange(4 * 3 * 16 * 16).reshape(4, 3, 16, 16)
+    here, there = (random_shift(pictures.to(device), 4, torch.Generator().manual_seed(0)) for device in ("cpu", "cuda"))
+    assert there.is_cuda and torch.equal(here, there.cpu())
+
+
+@pytest.mark.parametrize(("method", "changes"), [("policy_decorator", dict(H=1000, warmup="uniform")),
+                                                ("ppo_decorator", dict(H=2000, total_steps=6000, ppo_rollout=64))])
+def test_the_decorator_learns_on_the_gpu_and_a_run_goes_on_there(method, changes):
+    base, _ = imitate("mlp", reach_demos(aim=(0.2, -0.2)), ImitateConfig(iterations=300, lr=3e-3, eval_episodes=0), SMALL["mlp"],
+                      device="cuda", spec=PROBES["reach"])
+    seeds = range(1000, 1060)
+    before = evaluate(PROBES["reach"], base.act, seeds).success_once.mean()
+    trainers = [reach_trainer(method, base, device="cuda", alpha=0.8, alpha_scale=(), **changes) for _ in range(2)]
+    policy = trainers[0].train()
+    assert next(trainers[0].agent.actor.parameters()).is_cuda
+    assert evaluate(PROBES["reach"], policy.act, seeds, window=policy.window).success_once.mean() > before + 0.2
+    trainers[1].agent.load(trainers[0].agent.state())
+    for mine, theirs in zip(*(t.agent.actor.parameters() for t in trainers), strict=True):
+        assert theirs.is_cuda and torch.equal(mine, theirs)
