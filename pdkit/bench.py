@@ -33,6 +33,8 @@ from .tasks.stack_cube import StockStackCube
 from .tasks.vector import VectorEnv
 from .torch_setup import has_bf16, pick_device, set_threads
 
+PARTS = ("step", "updates", "base", "imitation", "profiles")
+
 
 def rate(work: Callable[[], int], seconds: float) -> float:
     """Units of work a second: `work` returns how many it did and is called until the time is up."""
@@ -246,16 +248,18 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--seconds", type=float, default=1.5, help="seconds per side and round (default 1.5; five rounds)")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--device", default="auto", help="auto, cpu or cuda: where the updates run")
+    parser.add_argument("--only", nargs="+", metavar="PART", choices=PARTS, default=PARTS, help=f"some of: {', '.join(PARTS)}")
     parser.add_argument("--quick", action="store_true", help="one short round of each, to see that all of it runs")
     args = parser.parse_args(argv)
     set_threads(args.threads)
     device = pick_device(args.device)
     seconds = 0.2 if args.quick else args.seconds
-    print(f"About {'1 minute' if args.quick else '5 minutes'}; {args.threads} thread(s), bfloat16 in hardware: {has_bf16(device)}, "
-          f"updates on {device}.", flush=True)
+    print(f"About {'1 minute' if args.quick else '5 minutes'} for all parts; {args.threads} thread(s), bfloat16 in hardware: "
+          f"{has_bf16(device)}, updates on {device}.", flush=True)
     results: dict[str, Any] = {}
-    for part in (lambda: bench_step(seconds), lambda: bench_updates(seconds, device), lambda: bench_base(seconds),
-                 lambda: bench_imitation(seconds, device)):
+    ratios = {"step": lambda: bench_step(seconds), "updates": lambda: bench_updates(seconds, device), "base": lambda: bench_base(seconds),
+              "imitation": lambda: bench_imitation(seconds, device)}
+    for part in (part for name, part in ratios.items() if name in args.only):
         for name, values in part().items():
             results[name] = values
             print(f"{name}\n    {values['first_per_s']:.0f} / {values['second_per_s']:.0f} = {values['ratio']:.2f} "
@@ -264,7 +268,7 @@ def main(argv: list[str]) -> int:
                            checkpoint_every=0),
              "lesson": dict(total_steps=2_300 if args.quick else 5_000, warmup_steps=2_000, eval_every=0, log_every=500,
                             checkpoint_every=0)}
-    for name, values in profile_costs(short, "Door").items():
+    for name, values in (profile_costs(short, "Door") if "profiles" in args.only else {}).items():
         results[name] = values
         print(f"{name}: {values['ms_per_env_step']:.2f} ms an environment step, so {values['env_steps']:,} steps take "
               f"{values['hours']:.2f} h", flush=True)

@@ -7,7 +7,6 @@ import math
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -149,7 +148,7 @@ def imitate(kind: str, demos: Demos, config: ImitateConfig | None = None, policy
             progress: Callable[[dict], None] | None = None, spec: TaskSpec | None = None) -> tuple[Policy, list[dict]]:
     """Train a policy of `kind` on `demos`; `spec` is for worlds outside the registry, such as the probes.
 
-    Returns the selected policy in evaluation mode, and one row per checkpoint: iteration, loss terms, seconds and, when
+    Returns the selected policy in evaluation mode, on `device`, and one row per checkpoint: iteration, loss terms, seconds and, when
     evaluated, success_once and success_at_end on the selection seeds. A policy without gradient steps, such as VINN, is only
     given the demonstrations: it has a single row, of iteration 0, and of `config` only the evaluation and the windows matter.
     """

@@ -44,7 +44,8 @@ def describe_machine() -> dict[str, Any]:
             versions[name] = None
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     return {"python": platform.python_version(), "system": f"{platform.system()} {platform.machine()}", "cores": cores,
-            "torch_threads": torch.get_num_threads(), "cuda": torch.cuda.is_available() and torch.cuda.get_device_name(), "versions": versions, "git": _git()}
+            "torch_threads": torch.get_num_threads(),
+            "cuda": torch.cuda.is_available() and torch.cuda.get_device_name(), "versions": versions, "git": _git()}
 
 
 def origin(base_card: dict[str, Any], demos: Any | None, encoder: Any | None = None) -> dict[str, Any]:

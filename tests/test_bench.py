@@ -5,9 +5,11 @@ import numpy as np
 import pytest
 import torch
 
-from pdkit.bench import EagerSAC, imitator, paired, updater
+from pdkit.bench import EagerSAC, imitator, main, paired, updater
 from pdkit.decorator import DecoratorConfig
 from pdkit.demos.sources import bundled
+from pdkit.errors import PdkitError
+from pdkit.files import read_json
 from pdkit.gradient_steps import gradient_step, make_optimizer
 from pdkit.imitate import ImitateConfig, Windows
 from pdkit.policies import MLP
@@ -59,3 +61,11 @@ def test_imitation_is_timed_with_the_same_gradient_step_on_both_sides():
     assert torch.allclose(*ends, atol=1e-6)
     for shipped in (True, False):
         assert imitator("mlp", demos, batch, "cpu", shipped)() == 1
+
+
+def test_parts_of_the_benchmark_can_be_measured_alone(tmp_path, capsys):
+    path = tmp_path / "it.json"
+    assert main(["--only", "base", "--quick", "--device", "cpu", "--json", str(path)]) == 0
+    assert list(read_json(path)["results"]) == ["base policy, BeT / MLP, 8 environments (decisions/s)"]
+    with pytest.raises(PdkitError, match="invalid choice: 'nothing'"):
+        main(["--only", "nothing"])

@@ -4,6 +4,7 @@ import pytest
 
 from pdkit import recorded
 from pdkit.errors import PdkitError
+from pdkit.files import read_json, write_json
 
 
 def test_rows_and_curves_of_one_task_are_loaded(results):
@@ -47,3 +48,21 @@ def test_the_picture_shows_every_policy_that_methods_start_from():
         assert {name: widths[name] for name in expected} == pytest.approx(expected)
         dashes = sorted(line.get_ydata()[0] / 100 for line in left.lines if line.get_linestyle() == "--")
         assert dashes == sorted(value for name, value in expected.items() if name.startswith("base"))
+
+
+def test_the_manifest_names_every_machine_that_made_rows(results, monkeypatch):
+    """Of one machine the newest commit; results of another stay labelled with theirs."""
+    row = pd.DataFrame({"task": ["Door"], "recipe": ["a"], "seed": [0], "command": ["pdkit x"]})
+    for number, (cores, commit) in enumerate([(2, "one"), (16, "two"), (2, "three")]):
+        monkeypatch.setattr(recorded, "describe_machine", lambda cores=cores, commit=commit: {"cores": cores, "git": commit})
+        recorded.record("x", row.assign(seed=number), pd.DataFrame())
+    manifest = read_json(results / "x_manifest.json")
+    assert manifest["machines"] == [{"cores": 16, "git": "two"}, {"cores": 2, "git": "three"}] and manifest["again"] == ["pdkit x"]
+    assert len(recorded.load("x")[0]) == 3
+
+
+def test_a_manifest_of_one_machine_is_taken_over(results, monkeypatch):
+    write_json(results / "x_manifest.json", {"machine": {"cores": 4, "git": "old"}})
+    monkeypatch.setattr(recorded, "describe_machine", lambda: {"cores": 2, "git": "new"})
+    recorded.record("x", pd.DataFrame({"task": ["Door"], "recipe": ["a"], "seed": [0], "command": ["pdkit x"]}), pd.DataFrame())
+    assert [machine["cores"] for machine in read_json(results / "x_manifest.json")["machines"]] == [4, 2]

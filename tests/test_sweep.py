@@ -304,7 +304,8 @@ def test_a_real_grid_of_two_trainings_is_recorded_and_skipped_the_second_time(tm
     assert table.command[1] == ("pdkit train decorated Door --method policy_decorator --profile smoke --recipe alpha=0.3 --episodes 2 "
                                 "--seeds 0 --set alpha=0.3")
     assert set(curves.recipe) == set(table.recipe) and curves.success_once.notna().sum() == 2
-    assert read_json(results / "tiny_manifest.json")["again"] == ["pdkit sweep spec.json --record tiny"]
+    manifest = read_json(results / "tiny_manifest.json")
+    assert manifest["again"] == ["pdkit sweep spec.json --record tiny"] and len(manifest["machines"]) == 1
     assert (results / "tiny.png").exists()
     capsys.readouterr()
     monkeypatch.setattr(Local, "start", None)  # nothing may start again

@@ -38,7 +38,8 @@ def imitate_pixels(kind: str, demos: Demos, pictures: Pictures, config: ImitateC
 
     `shift` is the random shift in pixels (the view's, if not given); `spec` and `view` are for worlds outside the registry.
     Returns the selected policy and encoder, on the CPU, in evaluation mode and with weights rounded to bfloat16 (as they are shipped),
-    and one row a checkpoint as `imitate` does. Raises PdkitError for a kind of policy that is not one of HEADS, or a loss that is no number.
+    and one row a checkpoint as `imitate` does. Raises PdkitError for a kind of policy that is not one of HEADS, or a loss that is no
+    number.
     """
     check_pixels(kind, shift)
     view, spec = view or view_of(demos.task), spec or get_task(demos.task)
@@ -110,7 +111,8 @@ def visual_settings(kind: str, view: View, spec: TaskSpec) -> dict[str, Any]:
 
 def _finished(policy: Policy, encoder: Encoder, demos: Demos, pictures: Pictures) -> tuple[Policy, Encoder]:
     """Copies as they will be used: weights rounded to bfloat16, the normaliser fitted to the features."""
-    encoder, policy = (copy.deepcopy(module).cpu().eval() for module in (encoder, policy))  # draws no random number: training goes on with them
+    # Copying draws no random number: training goes on with the originals.
+    encoder, policy = (copy.deepcopy(module).cpu().eval() for module in (encoder, policy))
     rounded(encoder)
     renormalise(policy, encoded(demos, pictures, encoder).observations)
     return rounded(policy), encoder.requires_grad_(False)
