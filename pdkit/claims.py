@@ -82,6 +82,12 @@ def difference(first: pd.Series, second: pd.Series) -> tuple[Interval, pd.Series
     return mean_interval(values), values
 
 
+def matched(*runs: pd.Series) -> tuple[pd.Series, ...]:
+    """The same runs without the seeds that not all of them have: means that stand beside a difference must be of what it compares."""
+    both = pd.concat(runs, axis=1, join="inner", keys=range(len(runs))).dropna()
+    return tuple(both[number] for number in both)
+
+
 def turned(interval: Interval) -> Interval:
     """Of the opposite difference."""
     return Interval(-interval.value, -interval.high, -interval.low)

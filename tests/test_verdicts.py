@@ -42,6 +42,16 @@ def test_students_t_covers_the_truth_where_a_bootstrap_of_few_seeds_does_not():
         assert np.mean([i.low < 0 < i.high for i in found]) == pytest.approx(0.95, abs=0.02)
 
 
+def test_means_beside_a_difference_are_of_the_seeds_that_it_compares(results):
+    """FISH has a fourth seed, the decorator three: what is said of both is of three."""
+    write(results, "leaderboard", runs("fish", [0.2, 0.2, 0.2, 1.0], base=0.1), runs("policy_decorator", [0.9] * 3, base=0.6))
+    found = verdicts.find("FISH fails mainly because the VINN policy below it performs extremely poorly.")
+    assert "FISH on VINN 20.0 %" in found.measured and found.seeds == "0 1 2"
+    one, two = claims.matched(*(pd.Series(values, pd.MultiIndex.from_product([["Door"], range(len(values))], names=["task", "seed"]))
+                                for values in ([1.0, 2.0, 3.0], [4.0, None])))
+    assert one.tolist() == [1.0] and two.tolist() == [4.0]
+
+
 def test_differences_are_taken_seed_by_seed():
     """Seeds differ much, the pairs hardly: unpaired, this interval would reach over zero."""
     table = pd.concat([runs("a", [0.1, 0.5, 0.9, 0.3]), runs("b", [0.05, 0.46, 0.84, 0.26]).iloc[::-1]])

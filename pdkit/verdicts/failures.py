@@ -20,6 +20,7 @@ from ..claims import (
     finding,
     jointly,
     judged,
+    matched,
     mean_interval,
     percent,
     points,
@@ -105,6 +106,7 @@ def _() -> Finding:
     bet = by_seed(recorded("leaderboard")[0], "calql", "decorated_success")
     gpt = by_seed(recorded("calql")[0], "calql_d", "decorated_success")
     told_apart(bet, gpt)
+    bet, gpt = matched(bet, gpt)
     interval, values = difference(bet, gpt)
     found = finding("calql", values, f"BeT (E) {percent(bet.mean())}, GPT (D) {percent(gpt.mean())}: {100 * interval.value:+.1f} points",
                     points(interval), judged(interval))

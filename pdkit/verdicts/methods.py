@@ -27,6 +27,7 @@ from ..claims import (
     first_evaluation,
     jointly,
     judged,
+    matched,
     mean_interval,
     percent,
     points,
@@ -114,11 +115,12 @@ def _() -> Finding:
     """The best one's end against the BeT that the decorator starts from; where it started from itself is told beside it."""
     table = _on_bet("adroit")
     rival = best(table, OTHERS)
-    base = by_seed(table, DECORATOR, "base_success")
-    interval, values = difference(by_seed(table, rival, "decorated_success"), base)
-    end, start = (by_seed(table, rival, column).mean() for column in ("decorated_success", "base_success"))
-    return finding("leaderboard", values, f"{rival} {percent(end)} (it starts at {percent(start)}), BeT base {percent(base.mean())}: "
-                   f"{100 * interval.value:+.1f} points", points(interval), judged(turned(interval)), TASKS["adroit"])
+    end, start, base = matched(by_seed(table, rival, "decorated_success"), by_seed(table, rival, "base_success"),
+                               by_seed(table, DECORATOR, "base_success"))
+    interval, values = difference(end, base)
+    told = (f"{rival} {percent(end.mean())} (it starts at {percent(start.mean())}), BeT base {percent(base.mean())}: "
+            f"{100 * interval.value:+.1f} points")
+    return finding("leaderboard", values, told, points(interval), judged(turned(interval)), TASKS["adroit"])
 
 
 @measures("JSRL gives jerky motion")
@@ -252,6 +254,7 @@ def _() -> Finding:
     table, _ = recorded("leaderboard")
     vinn, end = by_seed(table, "fish", "base_success"), by_seed(table, "fish", "decorated_success")
     bet = by_seed(table[table.task.isin(set(vinn.index.get_level_values("task")))], DECORATOR, "base_success")
+    vinn, end, bet = matched(vinn, end, bet)
     interval, values = difference(vinn, bet / 2)
     return finding("leaderboard", values, f"VINN {percent(vinn.mean())}, BeT {percent(bet.mean())}, FISH on VINN {percent(end.mean())}",
                    f"VINN less half of BeT: {points(interval)}", "not" if end.mean() >= bet.mean() else judged(turned(interval)), EIGHT)
