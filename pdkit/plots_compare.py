@@ -21,9 +21,10 @@ PALETTE = ["#1f6fb4", "#d1495b", "#2c9f6b", "#e0a030", "#7a4fa3", "#17a2b8", "#a
 BOOTSTRAP_SEED = 0  # of every interval here: a figure drawn twice is the same
 
 
-def labelled(table: pd.DataFrame, labels: dict[str, str] | None) -> dict[str, str]:
-    """Recipe -> what it is called in a figure, in drawing order: `labels` for those that the table has, or all by their names."""
-    present = list(dict.fromkeys(table.recipe))
+def labelled(table: pd.DataFrame, labels: dict[str, str] | None, own: pd.DataFrame | None = None) -> dict[str, str]:
+    """Recipe -> what it is called in a figure, in drawing order: `labels` for those that the table or the reader's `own` rows have, or all
+    by their names."""
+    present = list(dict.fromkeys([*table.recipe, *([] if own is None else own.recipe)]))
     return {r: r for r in present} if labels is None else {r: name for r, name in labels.items() if r in present}
 
 
@@ -73,7 +74,7 @@ def curves_figure(curves: pd.DataFrame, *, column: str = "success_once", labels:
         log: a logarithmic axis.
     """
     _columns(curves, "recipe", "seed", "step", column)
-    names = labelled(curves if own is None else pd.concat([curves, own]), labels)
+    names = labelled(curves, labels, own)
     color = colours(labels or names)
     figure, axes = blank(size=(7.6, 4.4))
     ax = axes[0, 0]
@@ -105,7 +106,7 @@ def finals_figure(table: pd.DataFrame, *, column: str = "decorated_success", lab
     `own` holds the reader's rows, drawn as open circles; the other arguments are those of `curves_figure`.
     """
     _columns(table, "recipe", "seed", column)
-    names = labelled(table if own is None else pd.concat([table, own]), labels)
+    names = labelled(table, labels, own)
     color, found = colours(labels or names), summary(table, column, labels).set_index("recipe")
     figure, axes = blank(size=(7.2, 1.2 + 0.42 * len(names)))
     ax = axes[0, 0]
@@ -163,7 +164,7 @@ def panels_figure(curves: pd.DataFrame, panels: Mapping[str, Sequence[str]], *, 
         own: the reader's own rows, dotted with open circles, in the panel that holds their recipe.
     """
     _columns(curves, "recipe", "seed", "step", column)
-    names = labelled(curves if own is None else pd.concat([curves, own]), labels)
+    names = labelled(curves, labels, own)
     color = colours(labels or names)
     count = len(panels)
     figure, axes = blank(-(-count // 2), min(count, 2), (6.6 * min(count, 2), 0.4 + 2.9 * -(-count // 2)), sharex=True, sharey=True)
@@ -247,7 +248,7 @@ def trade_figure(table: pd.DataFrame, *, x: str = "jerk", y: str = "success", la
     table = table.dropna(subset=wanted)
     if table.empty:
         raise PdkitError(f"No run of this table has both {x} and {y}.")
-    names = labelled(table if own is None else pd.concat([table, own]), labels)
+    names = labelled(table, labels, own)
     color = colours(labels or names)
     figure, axes = blank(size=(8.6, 4.6))
     ax = axes[0, 0]
