@@ -5,6 +5,7 @@ a CUDA graph and then replayed: the same kernels on the same memory, started tog
 """
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -25,7 +26,7 @@ Terms = dict[str, torch.Tensor]
 def make_optimizer(policy: Policy, config: ImitateConfig, others: Sequence[dict[str, Any]] = (), device: str = "cpu") -> torch.optim.AdamW:
     """AdamW over the policy's parameter groups and `others`, as one kernel for all of them; on a GPU it can be recorded."""
     groups = [*policy.parameter_groups(config.weight_decay), *others]
-    recorded = device == "cuda"  # a learning rate that is a number would be the same in every replay
+    recorded = torch.device(device).type == "cuda"  # a learning rate that is a number would be the same in every replay
     lr = torch.tensor(config.lr, device=device) if recorded else config.lr
     return torch.optim.AdamW(groups, lr=lr, betas=(config.beta1, 0.999), fused=True, capturable=recorded)
 
@@ -44,14 +45,15 @@ class GradientSteps:
     """Calling it takes one `gradient_step`, on a GPU a recorded one; batches must be of one shape.
 
     Args:
-        loss: of a batch's tensors: a dict of scalars of which `loss` is minimised. It draws no random numbers on the CPU and waits for
-            none of its results, or it could not be recorded.
+        loss: of a batch's tensors: a dict of scalars of which `loss` is minimised. To be recorded it must not wait for any of its results,
+            nor make, draw or copy anything on the CPU.
         optimizer: of `make_optimizer`, for the same device.
         bf16: autocast to bfloat16 where the device has it.
     """
 
     def __init__(self, loss: Callable[..., Terms], optimizer: torch.optim.Optimizer, device: str, bf16: bool):
-        self._step, self._optimizer, self._device = partial(gradient_step, loss, optimizer, device, bf16), optimizer, device
+        self._device, self._optimizer = torch.device(device).type, optimizer
+        self._step = partial(gradient_step, loss, optimizer, self._device, bf16)
         self._eager, self._graph = EAGER, None
 
     def __call__(self, *batch: torch.Tensor) -> Terms:
@@ -72,7 +74,9 @@ class GradientSteps:
         """A step on a stream of its own, as PyTorch asks for before recording."""
         stream = torch.cuda.Stream()
         stream.wait_stream(torch.cuda.current_stream())
-        with torch.cuda.stream(stream):
+        with torch.cuda.stream(stream), warnings.catch_warnings():
+            # The optimizer is made to be recorded, and wonders that it is not.
+            warnings.filterwarnings("ignore", message="This instance was constructed with capturable=True")
             terms = self._step(*batch)
         torch.cuda.current_stream().wait_stream(stream)
         return terms

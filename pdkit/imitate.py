@@ -17,7 +17,7 @@ from .errors import PdkitError, unknown
 from .evaluate import evaluate
 from .gradient_steps import GradientSteps, make_optimizer
 from .policies import POLICIES, Policy
-from .seeds import selection_seeds
+from .seeds import own_random_numbers, selection_seeds
 from .tasks import get_task
 from .tasks.spec import TaskSpec
 
@@ -115,7 +115,8 @@ class Average:
         if power:
             from diffusers.training_utils import EMAModel  # takes seconds to load
 
-            self._ema = EMAModel(self._parameters, use_ema_warmup=True, power=power, foreach=True)
+            # On a GPU all weights at once, or the average would take longer than the step; on a CPU that would only round differently.
+            self._ema = EMAModel(self._parameters, use_ema_warmup=True, power=power, foreach=self._parameters[0].is_cuda)
 
     def step(self) -> None:
         """Take in the weights as they are after a gradient step."""
@@ -200,8 +201,7 @@ def selection_scores(spec: TaskSpec, policy: Policy, config: ImitateConfig) -> d
     """Success on the selection seeds; nothing without episodes."""
     if not config.eval_episodes:
         return {}
-    state = torch.get_rng_state()  # training draws from it too
-    policy.reset(config.seed)
-    table = evaluate(spec, policy.act, selection_seeds(config.eval_episodes), window=policy.window, chunk=policy.chunk)
-    torch.set_rng_state(state)
+    with own_random_numbers():
+        policy.reset(config.seed)
+        table = evaluate(spec, policy.act, selection_seeds(config.eval_episodes), window=policy.window, chunk=policy.chunk)
     return {"success_once": float(table.success_once.mean()), "success_at_end": float(table.success_at_end.mean())}

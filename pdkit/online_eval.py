@@ -16,7 +16,7 @@ from .decorated import Decorated
 from .errors import PdkitError
 from .evaluate import evaluate
 from .policies import Policy
-from .seeds import selection_seeds
+from .seeds import own_random_numbers, selection_seeds
 from .tasks.spec import TaskSpec
 from .torch_setup import set_threads
 
@@ -98,11 +98,9 @@ class Evaluations:
 def _score(spec: TaskSpec, policy: Policy | Decorated, actor: nn.Module, episodes: int, seed: int, weights: State) -> dict[str, float]:
     started = time.monotonic()
     actor.load_state_dict(weights)
-    state = torch.get_rng_state()  # a base policy may draw from torch's global generator, and so does training
-    policy.reset(seed)
-    table = evaluate(spec, policy.act, selection_seeds(episodes), window=policy.window, chunk=policy.chunk,
-                     num_envs=LANES)
-    torch.set_rng_state(state)
+    with own_random_numbers():
+        policy.reset(seed)
+        table = evaluate(spec, policy.act, selection_seeds(episodes), window=policy.window, chunk=policy.chunk, num_envs=LANES)
     return {"success_once": float(table.success_once.mean()), "success_at_end": float(table.success_at_end.mean()),
             "eval_seconds": time.monotonic() - started}
 

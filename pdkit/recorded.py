@@ -24,8 +24,8 @@ KEYS = ["task", "recipe", "seed"]  # a row with the same ones is replaced
 def record(name: str, rows: pd.DataFrame, curves: pd.DataFrame) -> None:
     """Add rows to data/results/NAME.csv and, where there are curves, NAME_curves.csv, and draw NAME.png of trainings anew.
 
-    The manifest tells how to make all of it again (the column `sweep` of rows that have one, else `command`) and on what it was made:
-    this machine last, before it those of earlier rows.
+    The manifest tells how to make all of it again (the column `sweep` of rows that have one, else `command`) and which machines have
+    recorded here, this one last; a row's `cores` hint at which of them made it.
     """
     folder, tables = DATA / "results", []
     with _alone(name):
@@ -73,10 +73,11 @@ def by_arm(table: pd.DataFrame, group: str, field: str, name: str) -> pd.DataFra
 
 
 def _machines(path: Path) -> list[dict[str, Any]]:
-    """The machines of a manifest and this one, last; of the same machine only the newest commit."""
+    """The machines of a manifest and this one, last; of the same machine only the newest commit and threads."""
     this, old = describe_machine(), read_json(path) if path.exists() else {}
     earlier = old.get("machines") or [old[key] for key in ("machine",) if key in old]
-    return [machine for machine in earlier if machine | {"git": ""} != this | {"git": ""}] + [this]
+    newer = {name: this.get(name) for name in ("git", "torch_threads")}
+    return [machine for machine in earlier if machine | newer != this] + [this]
 
 
 @contextlib.contextmanager

@@ -1,6 +1,8 @@
 """Which seed is used for what. The ranges never overlap, so nothing is tuned on the episodes that are reported."""
 from __future__ import annotations
 
+from contextlib import AbstractContextManager
+
 import numpy as np
 
 TEST = 1_000_000  # + i: the episodes of every reported comparison
@@ -20,6 +22,14 @@ def selection_seeds(num: int) -> list[int]:
 
 def rollout_seeds(num: int) -> list[int]:
     return list(range(ROLLOUT, ROLLOUT + num))
+
+
+def own_random_numbers() -> AbstractContextManager:
+    """Within this block torch's global generators, the GPUs' too, may be seeded and drawn from; afterwards they go on as if it had not
+    been: policies draw while they act, and training draws from the same generators."""
+    import torch
+
+    return torch.random.fork_rng(devices=range(torch.cuda.device_count()))
 
 
 def training_seed(run_seed: int, lane: int, episode: int) -> int:

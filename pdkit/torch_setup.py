@@ -20,7 +20,7 @@ def pick_device(name: str = "auto") -> str:
     if name == "auto":
         return "cuda" if torch.cuda.is_available() else "cpu"
     if name == "cuda" and not torch.cuda.is_available():
-        raise PdkitError("No CUDA device was found; use device=cpu, or check the driver with `pdkit doctor`.")
+        raise PdkitError("No CUDA device was found; choose cpu as the device, or check the driver with `pdkit doctor`.")
     if name not in ("cpu", "cuda"):
         raise PdkitError(f"Unknown device {name!r}; choose one of: auto, cpu, cuda.")
     return name
@@ -30,7 +30,7 @@ def pick_device(name: str = "auto") -> str:
 def has_bf16(device: str = "cpu") -> bool:
     """Whether bfloat16 matrix products are done by the hardware (emulated ones are slower than float32)."""
     if device == "cuda":
-        return torch.cuda.is_bf16_supported()
+        return torch.cuda.is_bf16_supported(including_emulation=False)
     capability = torch.cpu.get_capabilities() if hasattr(torch.cpu, "get_capabilities") else {}
     flags = {k.lower() for k, v in capability.items() if v}
     return bool(flags & {"avx512_bf16", "amx_bf16", "bf16"}) or cpu_has_bf16()

@@ -111,7 +111,7 @@ def _base(args) -> int:
         if name not in fields | given:
             raise unknown("field", name, fields | given)
     config = checked(ImitateConfig, POLICIES[args.policy].recipe | {k: v for k, v in settings.items() if k in fields})
-    device = pick_device(args.device)
+    device = pick_device(args.device) if POLICIES[args.policy].learns else "cpu"
     out = Path(args.out) if args.out else runs_root() / "base" / f"{args.task}-{args.policy}{'-pixels' if args.pixels else ''}"
     print(f"{args.policy} on {demos.num} demonstrations of {args.task} ({demos.label}), on {device}: {config}", flush=True)
 
@@ -128,7 +128,7 @@ def _base(args) -> int:
         policy, history = imitate(args.policy, demos, config, architecture, device=device, progress=show)
     best = max(history, key=lambda row: row.get("success_once", row["iteration"]))
     info = {"task": args.task, "demos": demos.num, "demos_checksum": demos.checksum, "label": demos.label, "imitate": asdict(config),
-            "selected": best, "command": "pdkit train " + " ".join(sys.argv[2:]), "machine": describe_machine()}
+            "selected": best, "command": "pdkit train " + " ".join(sys.argv[2:]), "device": device, "machine": describe_machine()}
     if args.pixels:
         save_visual(policy, encoder, out, info)
     else:

@@ -2,12 +2,15 @@
 import numpy as np
 import pytest
 import torch
+from test_pixels import REACH, painted  # noqa: F401 (painted is a fixture)
 from worlds import reach_demos, reach_trainer
 
 from pdkit.evaluate import evaluate
 from pdkit.gradient_steps import GradientSteps, gradient_step, make_optimizer
 from pdkit.imitate import ImitateConfig, Windows, imitate
 from pdkit.pixels.encoders import random_shift
+from pdkit.pixels.learn import HEADS, imitate_pixels
+from pdkit.pixels.pictures import draw, encoded
 from pdkit.policies import POLICIES, load_policy, save_policy
 from pdkit.probes import PROBES
 
@@ -51,6 +54,25 @@ def test_imitation_on_the_gpu_learns_the_probe_and_its_checkpoint_loads_on_the_c
     save_policy(policy, tmp_path / "it")
     loaded, windows = load_policy(tmp_path / "it"), np.random.default_rng(0).normal(size=(5, 1, 4)).astype(np.float32)
     np.testing.assert_allclose(loaded.act(windows), policy.act(windows), atol=1e-5)
+
+
+def test_what_checkpoints_draw_does_not_change_the_training():
+    """Dropout draws from the GPU's generator, which acting seeds."""
+    last = [imitate("bet", reach_demos(4), ImitateConfig(iterations=6, batch=16, eval_every=every, eval_episodes=1, bf16=False),
+                    SMALL["bet"] | {"dropout": 0.5}, device="cuda", spec=PROBES["reach"])[1][-1]["loss"] for every in (1, 6)]
+    assert last[0] == pytest.approx(last[1], rel=1e-4)
+
+
+@pytest.mark.usefixtures("painted")
+@pytest.mark.parametrize("kind", HEADS)
+def test_policies_learn_from_pictures_on_the_gpu(kind):
+    demos = reach_demos(4)
+    pictures, config = draw(demos, spec=PROBES["reach"], view=REACH), ImitateConfig(iterations=8, batch=8, eval_every=4, eval_episodes=2)
+    policy, encoder, history = imitate_pixels(kind, demos, pictures, config, SMALL[kind], device="cuda", spec=PROBES["reach"], view=REACH)
+    assert len(history) == 2 and history[1]["loss"] < history[0]["loss"]
+    assert not any(parameter.is_cuda for parameter in (*policy.parameters(), *encoder.parameters()))
+    seen = encoded(demos, pictures, encoder).observations
+    assert np.isfinite(policy.act(seen[: 2 * policy.window].reshape(2, policy.window, -1))).all()
 
 
 def test_random_shift_is_the_same_on_both_devices():

@@ -286,6 +286,6 @@ def test_what_dppo_cannot_use_is_refused(tmp_path):
 
 
 def test_a_task_without_a_diffusion_policy_is_told_what_to_give(capsys):
-    assert cli.main(["train", "decorated", "Door", "--method", "dppo"]) == 2
+    assert cli.main(["train", "decorated", "Pen", "--method", "dppo"]) == 2
     said = capsys.readouterr().err
-    assert "`pdkit train base Door --policy diffusion`" in said and "--base" in said and len(said.strip().splitlines()) == 1
+    assert "`pdkit train base Pen --policy diffusion`" in said and "--base" in said and len(said.strip().splitlines()) == 1

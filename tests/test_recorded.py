@@ -50,19 +50,21 @@ def test_the_picture_shows_every_policy_that_methods_start_from():
         assert dashes == sorted(value for name, value in expected.items() if name.startswith("base"))
 
 
-def test_the_manifest_names_every_machine_that_made_rows(results, monkeypatch):
+def test_the_manifest_names_every_machine_that_recorded(results, monkeypatch):
     """Of one machine the newest commit; results of another stay labelled with theirs."""
     row = pd.DataFrame({"task": ["Door"], "recipe": ["a"], "seed": [0], "command": ["pdkit x"]})
     for number, (cores, commit) in enumerate([(2, "one"), (16, "two"), (2, "three")]):
-        monkeypatch.setattr(recorded, "describe_machine", lambda cores=cores, commit=commit: {"cores": cores, "git": commit})
+        machine = {"cores": cores, "torch_threads": len(commit), "git": commit}
+        monkeypatch.setattr(recorded, "describe_machine", lambda machine=machine: machine)
         recorded.record("x", row.assign(seed=number), pd.DataFrame())
     manifest = read_json(results / "x_manifest.json")
-    assert manifest["machines"] == [{"cores": 16, "git": "two"}, {"cores": 2, "git": "three"}] and manifest["again"] == ["pdkit x"]
+    assert [(machine["cores"], machine["git"]) for machine in manifest["machines"]] == [(16, "two"), (2, "three")]
+    assert manifest["again"] == ["pdkit x"]
     assert len(recorded.load("x")[0]) == 3
 
 
 def test_a_manifest_of_one_machine_is_taken_over(results, monkeypatch):
     write_json(results / "x_manifest.json", {"machine": {"cores": 4, "git": "old"}})
-    monkeypatch.setattr(recorded, "describe_machine", lambda: {"cores": 2, "git": "new"})
+    monkeypatch.setattr(recorded, "describe_machine", lambda: {"cores": 2, "torch_threads": 1, "git": "new"})
     recorded.record("x", pd.DataFrame({"task": ["Door"], "recipe": ["a"], "seed": [0], "command": ["pdkit x"]}), pd.DataFrame())
     assert [machine["cores"] for machine in read_json(results / "x_manifest.json")["machines"]] == [4, 2]

@@ -89,10 +89,11 @@ class DiffusionPolicy(Policy):
 
     def condition(self, windows: torch.Tensor) -> torch.Tensor:
         """What the U-Net sees of windows (N, window, obs_dim): (N, window * obs_dim)."""
-        return self.seen_scale()(windows).flatten(1)
+        seen = self.normalizer(windows)
+        return (seen if self.scale is None else self.scale(seen)).flatten(1)
 
     def seen_scale(self) -> Normalizer:
-        """How the network sees observations: the normaliser, with the network's own scale on top where there is one."""
+        """How the network sees observations, as one: the normaliser, with the network's own scale on top where there is one."""
         if self.scale is None:
             return self.normalizer
         both = Normalizer(self.config["obs_dim"]).to(self.normalizer.mean.device)
