@@ -194,8 +194,8 @@ def compared(record: str, first: str, second: str = "", *, column: str = "decora
                    judged(interval if sign > 0 else turned(interval), enough), paper)
 
 
-def ahead(record: str, table: pd.DataFrame, own: str, kinds: Mapping[str, Sequence[str]], paper: Sequence[str], beside: str = ""
-          ) -> Finding:
+def ahead(record: str | Sequence[str], table: pd.DataFrame, own: str, kinds: Mapping[str, Sequence[str]], paper: Sequence[str],
+          beside: str = "") -> Finding:
     """A finding of the kind "`own` beats the best recipe of every kind": the interval is that of the smallest lead, the verdict that of the
     weakest. `beside` is told behind what was measured."""
     mine, leads = by_seed(table, own, "decorated_success"), []
@@ -208,13 +208,17 @@ def ahead(record: str, table: pd.DataFrame, own: str, kinds: Mapping[str, Sequen
                    weakest(*(judged(lead[0]) for lead in leads)), paper)
 
 
-def finding(record: str, values: pd.Series, measured: str, interval: str, verdict: str, paper: Sequence[str] = ()) -> Finding:
-    """A finding from values by (task, seed); "reproduced" counts as partly where tasks of the claim are missing."""
+def finding(record: str | Sequence[str], values: pd.Series, measured: str, interval: str, verdict: str, paper: Sequence[str] = ()
+            ) -> Finding:
+    """A finding from values by (task, seed), of one record or several; "reproduced" counts as partly where tasks of the claim are
+    missing."""
     tasks = list(dict.fromkeys(values.index.get_level_values("task")))
     if verdict == "reproduced" and not set(paper) <= set(tasks):
         verdict = "partly"
     seeds = " ".join(str(seed) for seed in sorted(set(values.index.get_level_values("seed"))))
-    return Finding(" ".join(tasks), seeds, measured, interval, verdict, "; ".join(commands(record, tasks)))
+    records = [record] if isinstance(record, str) else [name for name in record if set(recorded(name)[0].task) & set(tasks)]
+    made = [command for name in records for command in commands(name, tasks)]
+    return Finding(" ".join(tasks), seeds, measured, interval, verdict, "; ".join(made))
 
 
 def commands(record: str, tasks: Sequence[str]) -> list[str]:

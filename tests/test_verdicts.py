@@ -452,6 +452,17 @@ def test_diffusion_policy_is_judged_by_the_papers_bound(results, ends, dipo, lif
     assert [one.verdict for one in found] == [lifts, beats, best] and found[0].tasks == "StackCube" and "residual_rl" in found[1].measured
 
 
+def test_diffusion_policy_is_judged_on_both_tasks_that_have_enough_seeds(results):
+    """Door's decorator is called otherwise than StackCube's, which counts from three seeds on."""
+    claim = CLAIMS.claim[CLAIMS.claim.str.startswith("Policy Decorator lifts Diffusion")].iloc[0]
+    write(results, "diffusion_door", runs("policy_decorator", [0.9, 0.92, 0.94], base=0.2))
+    for cube, tasks, start in (([0.5], "Door", "20.0 %"), ([0.5, 0.52, 0.51], "StackCube Door", "40.0 %")):
+        write(results, "diffusion_finetuning", runs(OWN, cube, task="StackCube", base=0.6),
+              runs("policy_decorator", [0.0] * 3, task="StackCube", base=0.6))
+        found = verdicts.find(claim)
+        assert found.tasks == tasks and found.measured.startswith(start) and found.command.count("pdkit sweep") == len(tasks.split())
+
+
 def test_dppo_is_compared_on_other_tasks_than_the_papers(results):
     claim = CLAIMS.claim[CLAIMS.claim.str.startswith("Policy Decorator on DPPO")].iloc[0]
     for dppo, verdict in (([0.5, 0.55, 0.6], "partly"), ([0.9, 0.95, 0.99], "not")):
