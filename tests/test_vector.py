@@ -7,7 +7,7 @@ import pytest
 from pdkit.errors import PdkitError
 from pdkit.evaluate import evaluate
 from pdkit.probes import PROBES
-from pdkit.tasks import TASKS, get_task
+from pdkit.tasks import TASKS, get_task, lanes
 from pdkit.tasks.lanes import IDLE
 from pdkit.tasks.spec import TaskSpec
 from pdkit.tasks.vector import VectorEnv
@@ -173,6 +173,53 @@ def test_evaluation_counts_every_seed_once_in_order():
     assert table.success_once.tolist() == [True, False, True, False, True]
     with pytest.raises(PdkitError):
         evaluate(COUNT, lambda w: w, [])
+
+
+def test_simulations_that_take_long_to_build_are_kept_but_not_after_an_error():
+    built, closed = [], []
+
+    class Slow(CountSim):
+        slow_to_build = True
+
+        def __init__(self):
+            built.append(self)
+
+        def close(self):
+            closed.append(self)
+
+    spec = dataclasses.replace(COUNT, make=Slow)
+    for _ in range(2):
+        with VectorEnv(spec, 2, counting_seeds()) as env:
+            env.reset()
+            env.step(act(NO, NO))
+    assert len(built) == 2 and not closed
+    with pytest.raises(PdkitError), VectorEnv(spec, 3, counting_seeds()) as env:
+        env.reset()
+        env.step(act(NO))  # of the wrong shape
+    assert len(built) == 3 == len(closed)
+    with VectorEnv(spec, 1, counting_seeds()) as env:
+        env.reset()
+    assert len(built) == 4
+    lanes.close_spares()
+    assert len(closed) == 4
+    with VectorEnv(COUNT, 1, counting_seeds()) as env:  # what is quickly built is not kept
+        env.reset()
+    assert CountSim not in lanes._spare
+
+
+def test_an_evaluation_in_kept_simulations_repeats_to_the_last_bit():
+    """As in new ones: whatever was simulated before, contacts above all, a reset leaves nothing of it."""
+    spec, rng = get_task("StackCube"), np.random.default_rng(0)
+    pushes = rng.uniform(-1, 1, (30, 1, 4)).astype(np.float32)
+    pushes[:, :, 2] = -0.5  # down, into the table and the cubes
+
+    def pushed(seeds):
+        step = iter(pushes)
+        return evaluate(spec, lambda windows: np.repeat(next(step)[None], len(windows), axis=0), seeds, num_envs=2, max_episode_steps=30)
+
+    lanes.close_spares()
+    first, _, again = pushed([1, 2]), pushed([3, 4]), pushed([1, 2])
+    assert len(lanes._spare[spec.make]) == 2 and first.equals(again)
 
 
 @pytest.mark.parametrize("name", ["Door", "Pen", "Hammer", "Relocate"])

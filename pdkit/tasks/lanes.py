@@ -1,17 +1,47 @@
 """Lanes: a simulator with its episode, and where they run, in this process or in workers (see vector.py)."""
 from __future__ import annotations
 
+import atexit
 import multiprocessing
 import signal
+from collections.abc import Callable
 from multiprocessing import shared_memory
 
 import numpy as np
 
 from ..errors import PdkitError
-from .spec import TaskSpec
+from .spec import Sim, TaskSpec
 
 IDLE = -1  # instead of a seed: this lane has nothing more to do
 DIED = "A simulator process died; run `pdkit doctor`, or set env_workers=0 to see its error."
+
+
+SPARES = 100  # at most so many are kept of a kind
+
+_spare: dict[Callable[..., Sim], list[Sim]] = {}  # simulations of closed lanes that take long to build, by what makes them
+
+
+def _simulation(spec: TaskSpec) -> Sim:
+    """A simulation that was kept, or a new one. Which it is makes no difference: `reset` alone decides what follows (see `Sim`)."""
+    kept = _spare.get(spec.make)
+    return kept.pop() if kept else spec.make()
+
+
+def _keep(spec: TaskSpec, sim: Sim) -> None:
+    """Keep a simulation for the next lanes where that is worth it, or close it."""
+    kept = _spare.setdefault(spec.make, []) if getattr(sim, "slow_to_build", False) else None
+    if kept is None or len(kept) >= SPARES:
+        sim.close()
+    else:
+        kept.append(sim)
+
+
+@atexit.register
+def close_spares() -> None:
+    """Close all simulations that are kept."""
+    while _spare:
+        for sim in _spare.popitem()[1]:
+            sim.close()
 
 
 class _Lane:
@@ -48,7 +78,8 @@ class _Lanes:
     """A group of lanes stepped one after the other, writing into shared arrays."""
 
     def __init__(self, spec: TaskSpec, count: int, *rules):
-        self.lanes = [_Lane(spec.make(), *rules) for _ in range(count)]
+        self._spec = spec
+        self.lanes = [_Lane(_simulation(spec), *rules) for _ in range(count)]
 
     def step(self, arrays: dict[str, np.ndarray]) -> None:
         for i, lane in enumerate(self.lanes):
@@ -88,9 +119,10 @@ class _Lanes:
             out.append(np.stack(observations))
         return out
 
-    def close(self) -> None:
+    def close(self, keep: bool) -> None:
+        """Give up the simulations; `keep` them for other lanes, unless something went wrong in them."""
         for lane in self.lanes:
-            lane.sim.close()
+            _keep(self._spec, lane.sim) if keep else lane.sim.close()
 
 
 class InProcess:
@@ -115,8 +147,8 @@ class InProcess:
     def replay(self, histories):
         return self._lanes.replay(histories)
 
-    def close(self) -> None:
-        self._lanes.close()
+    def close(self, keep: bool) -> None:
+        self._lanes.close(keep)
 
 
 class Workers:
@@ -174,7 +206,8 @@ class Workers:
             self._tell(pipe, ("replay", histories[part]))
         return [item for pipe in self._pipes for item in self._expect(pipe)]
 
-    def close(self) -> None:
+    def close(self, keep: bool = False) -> None:
+        """End the processes; nothing of theirs can be kept."""
         for pipe in self._pipes:
             try:
                 pipe.send(("close", None))
@@ -224,5 +257,5 @@ def _worker(pipe, names, shapes, part: slice, arguments) -> None:
         pipe.send(PdkitError(f"A simulator process failed: {type(error).__name__}: {error}"))
     finally:
         if lanes is not None:
-            lanes.close()
+            lanes.close(keep=False)
         arrays.clear()

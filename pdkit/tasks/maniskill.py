@@ -34,6 +34,7 @@ class FastSim:
     env_id: ClassVar[str]
     control: ClassVar[str]  # ManiSkill's name of the control mode
     camera: ClassVar[Camera]  # where the camera is and what it looks at, metres
+    slow_to_build: ClassVar[bool] = True  # as long as some hundred steps take: lanes keep it when they are closed
 
     def __init__(self, render: bool = False):
         self._env = self.build(render)

@@ -159,10 +159,10 @@ class VectorEnv:
         return self._windows.copy()
 
     def close(self) -> None:
-        self._backend.close()
+        self._backend.close(keep=True)
 
     def __enter__(self) -> VectorEnv:
         return self
 
-    def __exit__(self, *_) -> None:
-        self.close()
+    def __exit__(self, failed: type[BaseException] | None, *_) -> None:
+        self._backend.close(keep=failed is None)
