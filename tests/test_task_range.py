@@ -42,3 +42,15 @@ def test_the_figure_names_what_is_not_recorded(tasks):
     assert labels[5] == "Door (3 seeds)" and len(labels) == 10
     squares = [line for line in ax.lines if line.get_marker() == "s"]
     assert [float(np.ravel(line.get_xdata())[0]) for line in squares] == pytest.approx([0.3625, 0.98325, 0.4675, 0.99575])
+
+
+def test_what_is_recorded_over_a_diffusion_policy(results):
+    """The cell with the official bound counts; a record that is not there is left out."""
+    assert task_range.over_diffusion().empty
+    rows = pd.DataFrame([dict(task="StackCube", recipe=recipe, policy="diffusion", seed=0, episodes=60, env_steps=16_000, base_success=0.7,
+                              decorated_success=end, decorated_success_at_end=0.1)
+                         for recipe, end in (("policy_decorator", 0.1), ("policy_decorator,alpha=0.03", 0.6), ("dppo", 0.9))])
+    rows.to_csv(results / "diffusion_finetuning.csv", index=False)
+    (row,) = task_range.over_diffusion().to_dict("records")
+    assert (row["task"], row["suite"], row["policy"], row["seeds"], row["demos"]) == ("StackCube", "maniskill", "diffusion", 1, 300)
+    assert row["base"] == pytest.approx(0.7) and row["decorated"] == pytest.approx(0.6) and row["at_end"] == pytest.approx(0.1)

@@ -30,9 +30,9 @@ from ..claims import (
     recorded,
     told_apart,
 )
+from ..task_range import DIFFUSION
 from .registry import EIGHT, measures
 
-RECORDS = {"diffusion_finetuning": "policy_decorator,alpha=0.03", "diffusion_door": DECORATOR}  # the decorator's cell: the official bound
 TUNED, KEPT = ("dipo",), ("residual_rl", "jsrl")  # the paper's baselines over Diffusion Policy; DPPO is none of Fig. 1's
 COLUMNS = ["task", "recipe", "seed", "base_success", "decorated_success"]
 
@@ -43,7 +43,7 @@ def _recorded() -> tuple[list[str], pd.DataFrame]:
     Raises TooLittle where there are none.
     """
     tables = {}
-    for record, own in RECORDS.items():
+    for record, own in DIFFUSION.items():
         with contextlib.suppress(TooLittle):
             table = recorded(record)[0][COLUMNS]
             others = table.recipe.str.startswith(DECORATOR) & (table.recipe != own)
