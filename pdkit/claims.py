@@ -204,7 +204,8 @@ def ahead(record: str | Sequence[str], table: pd.DataFrame, own: str, kinds: Map
         interval, values = difference(mine, by_seed(table, rival, "decorated_success"))
         leads.append((interval, values, f"{100 * interval.value:+.1f} points against {rival} (best of {kind})"))
     interval, values, _ = min(leads, key=lambda lead: lead[0].value)
-    return finding(record, values, f"{percent(mine.mean())}: " + ", ".join(lead[2] for lead in leads) + beside, points(interval),
+    told = f"{percent(mine.loc[values.index].mean())}: " + ", ".join(lead[2] for lead in leads) + beside
+    return finding(record, values, told, points(interval),
                    weakest(*(judged(lead[0]) for lead in leads)), paper)
 
 

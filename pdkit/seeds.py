@@ -25,11 +25,11 @@ def rollout_seeds(num: int) -> list[int]:
 
 
 def own_random_numbers() -> AbstractContextManager:
-    """Within this block torch's global generators, the GPUs' too, may be seeded and drawn from; afterwards they go on as if it had not
-    been: policies draw while they act, and training draws from the same generators."""
+    """Within this block torch's global generators, the GPUs' too where they are in use already, may be seeded and drawn from; afterwards
+    they go on as if it had not been: policies draw while they act, and training draws from the same generators."""
     import torch
 
-    return torch.random.fork_rng(devices=range(torch.cuda.device_count()))
+    return torch.random.fork_rng(devices=range(torch.cuda.device_count()) if torch.cuda.is_initialized() else [])
 
 
 def training_seed(run_seed: int, lane: int, episode: int) -> int:

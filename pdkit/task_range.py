@@ -22,7 +22,8 @@ PAPER = {  # percent, means over tasks (facts of Fig. 1): base policy, decorated
     "adroit": (46.75, 99.575),
 }
 SUITES = ("maniskill", "adroit")
-# Records of methods over a Diffusion Policy, and the decorator's cell in each: the one with the official bound.
+# Records of methods over a Diffusion Policy, and the decorator's cell in each, chosen before it was run: on StackCube the paper's bound for
+# it over a BeT, on Door the official script's default over a Diffusion Policy (the paper's own for either are not known).
 DIFFUSION = {"diffusion_finetuning": "policy_decorator,alpha=0.03", "diffusion_door": "policy_decorator"}
 PAPER_DIFFUSION = (52.55, 99.9)  # percent, the mean over six tasks (Fig. 1): base policy, decorated
 COLUMNS = ["task", "suite", "policy", "demos", "label", "seeds", "episodes", "env_steps", "base", "base_low", "base_high", "decorated",

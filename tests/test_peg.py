@@ -198,3 +198,18 @@ def test_expert_picks_up_a_dropped_peg(fast):
         observation, success = fast.step(action)
         steps += 1
     assert drop == 0 and success
+
+
+def test_peg_and_box_are_of_the_tasks_material_whatever_was_built_since():
+    """Bodies are built anew in each episode, of a material that is global, and the chairs' is another."""
+    sim, chair = get_task("PegInsertionSide").make(), get_task("PushChair").make()
+
+    def friction():
+        sim.reset(0)
+        return [shape.physical_material.static_friction for body in (sim._peg, sim._box) for shape in body.collision_shapes]
+
+    before = friction()
+    chair.reset(0)
+    assert friction() == before and len(set(before)) == 1
+    sim.close()
+    chair.close()

@@ -45,7 +45,7 @@ def test_the_figure_names_what_is_not_recorded(tasks):
 
 
 def test_what_is_recorded_over_a_diffusion_policy(results):
-    """The cell with the official bound counts; a record that is not there is left out."""
+    """The cell chosen for each task counts; a record that is not there is left out."""
     assert task_range.over_diffusion().empty
     rows = pd.DataFrame([dict(task="StackCube", recipe=recipe, policy="diffusion", seed=0, episodes=60, env_steps=16_000, base_success=0.7,
                               decorated_success=end, decorated_success_at_end=0.1)

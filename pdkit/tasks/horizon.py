@@ -21,6 +21,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from ..errors import PdkitError
+from ..seeds import own_random_numbers
 from .spec import Sim, TaskSpec
 
 PATIENCE = 2.0  # a guide has failed at this multiple of the longest way among the demonstrations
@@ -77,7 +78,7 @@ class Ways:
         threads = torch.get_num_threads()
         torch.set_num_threads(1)
         try:
-            with torch.random.fork_rng(devices=[]):
+            with own_random_numbers():
                 self.guide.reset(seed)
                 window, actions = np.repeat(sim.reset(seed)[None], self.guide.window, axis=0), []
                 while len(actions) < self.limit:

@@ -16,14 +16,14 @@ IDLE = -1  # instead of a seed: this lane has nothing more to do
 DIED = "A simulator process died; run `pdkit doctor`, or set env_workers=0 to see its error."
 
 
-SPARES = 100  # at most so many are kept of a kind
+SPARES = 50  # at most so many are kept of a kind: the lanes of the largest evaluations
 
 _spare: dict[Callable[..., Sim], list[Sim]] = {}  # simulations of closed lanes that take long to build, by what makes them
 
 
 def _simulation(spec: TaskSpec) -> Sim:
     """A simulation that was kept, or a new one. Which it is makes no difference: `reset` alone decides what follows (see `Sim`)."""
-    kept = _spare.get(spec.make)
+    kept = _spare.get(spec.make) if _spare else None
     return kept.pop() if kept else spec.make()
 
 
@@ -120,8 +120,9 @@ class _Lanes:
         return out
 
     def close(self, keep: bool) -> None:
-        """Give up the simulations; `keep` them for other lanes, unless something went wrong in them."""
-        for lane in self.lanes:
+        """Give up the simulations; `keep` them for other lanes, unless something went wrong in them. A second time nothing is left."""
+        lanes, self.lanes = self.lanes, []
+        for lane in lanes:
             _keep(self._spec, lane.sim) if keep else lane.sim.close()
 
 

@@ -82,6 +82,8 @@ class PegInsertionSide(FastSim):
         scene = self._env.scene.sub_scenes[0]
         for entity in self._bodies:
             scene.remove_entity(entity)
+        # What bodies are made of is global, and another task's scene may have set its own since this one was built.
+        sapien.physx.set_default_material(**self._env.sim_config.default_materials_config.dict())
         with building(self._can_render):
             self._bodies = [_peg(self._env.scene, start), _box(self._env.scene, start)]
         for entity in self._bodies:

@@ -38,18 +38,16 @@ COLUMNS = ["task", "recipe", "seed", "base_success", "decorated_success"]
 
 
 def _recorded() -> tuple[list[str], pd.DataFrame]:
-    """The records that tell anything, and their rows of the tasks on which the decorator has three seeds, its cell under one name.
-
-    Raises TooLittle where there are none.
-    """
+    """The records that tell anything, and of the tasks on which the decorator has three seeds the rows of all methods that have as many
+    there; the decorator's cell under one name. Raises TooLittle where there are none."""
     tables = {}
     for record, own in DIFFUSION.items():
         with contextlib.suppress(TooLittle):
             table = recorded(record)[0][COLUMNS]
             others = table.recipe.str.startswith(DECORATOR) & (table.recipe != own)
             table = table[~others].assign(recipe=table.recipe.replace(own, DECORATOR))
-            seeds = table[table.recipe == DECORATOR].groupby("task").seed.nunique()
-            if len(table := table[table.task.isin(seeds.index[seeds >= LEAST_SEEDS])]):
+            table = table[table.groupby(["task", "recipe"]).seed.transform("nunique") >= LEAST_SEEDS]
+            if len(table := table[table.task.isin(table.task[table.recipe == DECORATOR])]):
                 tables[record] = table
     if not tables:
         raise TooLittle(f"Fewer than {LEAST_SEEDS} seeds of the decorator over a Diffusion Policy are recorded.")

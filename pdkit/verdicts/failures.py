@@ -46,6 +46,7 @@ def _() -> Finding:
     ends, ways = ([of(recipe) for recipe in ("calql", "sac_finetune")] for of in (
         lambda recipe: by_seed(table, recipe, "decorated_success"), lambda recipe: efficiency(curves, recipe)))
     told_apart(*ends, *ways)
+    ends, ways = matched(*ends), matched(*ways)
     (end, values), (way, _) = difference(*ends), difference(*ways)
     return finding("leaderboard", values, f"Cal-QL and SAC fine-tuning: at the end {percent(ends[0].mean())}, {percent(ends[1].mean())}; "
                    f"over all evaluations {percent(ways[0].mean())}, {percent(ways[1].mean())}",
@@ -58,6 +59,7 @@ def _efficiency(first: str, second: str) -> tuple[Interval, pd.Series, str]:
     _, curves = recorded("calql")
     one, two = efficiency(curves, first), efficiency(curves, second)
     told_apart(one, two)
+    one, two = matched(one, two)
     interval, values = difference(one, two)
     return interval, values, f"mean success over the online evaluations {percent(one.mean())} and {percent(two.mean())}"
 

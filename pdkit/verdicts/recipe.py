@@ -4,7 +4,7 @@ from __future__ import annotations
 from functools import partial
 
 from ..ablations import GRID, action_scales, alpha_works
-from ..claims import Finding, by_seed, compared, difference, finding, jointly, judged, percent, points, recorded, weakest
+from ..claims import Finding, by_seed, compared, difference, finding, jointly, judged, matched, percent, points, recorded, weakest
 from ..demos import sources
 from .registry import measures
 
@@ -41,7 +41,7 @@ def _() -> Finding:
     policy. The grid's H differ by a factor of two only, which is no wide range: partly at most. H=0 is another claim's (G.1)."""
     table, _ = recorded("ablations")
     wide = "alpha=0.1,H=40000"
-    own, ends = by_seed(table, GRID, "decorated_success"), by_seed(table, wide, "decorated_success")
+    own, ends = matched(by_seed(table, GRID, "decorated_success"), by_seed(table, wide, "decorated_success"))
     interval, values = difference(ends, own)
     gain, _ = difference(ends, by_seed(table, wide, "base_success"))
     verdict = weakest(judged(interval, -0.1), judged(gain), "partly")
