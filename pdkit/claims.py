@@ -186,12 +186,18 @@ def compared(record: str, first: str, second: str = "", *, column: str = "decora
     """
     table, _ = recorded(record)
     one, two = by_seed(table, first, column), by_seed(table, second or first, second_column or column)
+    names = names[0] or first, names[1] or second or "its base policy"
+    return set_against(record, one, two, names, sign=sign, enough=enough, paper=paper)
+
+
+def set_against(record: str | Sequence[str], one: pd.Series, two: pd.Series, names: tuple[str, str], *, sign: int = 1, enough: float = 0.0,
+                paper: Sequence[str] = ()) -> Finding:
+    """The same for runs by (task, seed), from wherever; `names` says what both are called."""
     told_apart(one, two)
+    one, two = matched(one, two)
     interval, values = difference(one, two)
-    a, b = names[0] or first, names[1] or second or "its base policy"
-    mine, theirs = (percent(series.loc[values.index].mean()) for series in (one, two))
-    return finding(record, values, f"{a} {mine}, {b} {theirs}: {100 * interval.value:+.1f} points", points(interval),
-                   judged(interval if sign > 0 else turned(interval), enough), paper)
+    told = f"{names[0]} {percent(one.mean())}, {names[1]} {percent(two.mean())}: {100 * interval.value:+.1f} points"
+    return finding(record, values, told, points(interval), judged(interval if sign > 0 else turned(interval), enough), paper)
 
 
 def ahead(record: str | Sequence[str], table: pd.DataFrame, own: str, kinds: Mapping[str, Sequence[str]], paper: Sequence[str],

@@ -23,12 +23,11 @@ from ..claims import (
     finding,
     jointly,
     judged,
-    matched,
     mean_interval,
     percent,
     points,
     recorded,
-    told_apart,
+    set_against,
 )
 from ..task_range import DIFFUSION
 from .registry import EIGHT, measures
@@ -85,8 +84,4 @@ def _() -> Finding:
     """Significantly: the whole interval of the lead lies above 0. On other tasks than the paper's, so partly at most."""
     records, table = _recorded()
     one, two = (by_seed(table, recipe, "decorated_success") for recipe in (DECORATOR, "dppo"))
-    told_apart(one, two)
-    one, two = matched(one, two)
-    interval, values = difference(one, two)
-    return finding(records, values, f"{DECORATOR} {percent(one.mean())}, dppo {percent(two.mean())}: {100 * interval.value:+.1f} points",
-                   points(interval), judged(interval), ("Square", "Transport"))
+    return set_against(records, one, two, (DECORATOR, "dppo"), paper=("Square", "Transport"))

@@ -25,6 +25,7 @@ from ..claims import (
     percent,
     points,
     recorded,
+    set_against,
     times,
     told_apart,
     turned,
@@ -107,12 +108,7 @@ def _() -> Finding:
     """E and D come from two sweeps with the same budget, seeds and test episodes."""
     bet = by_seed(recorded("leaderboard")[0], "calql", "decorated_success")
     gpt = by_seed(recorded("calql")[0], "calql_d", "decorated_success")
-    told_apart(bet, gpt)
-    bet, gpt = matched(bet, gpt)
-    interval, values = difference(bet, gpt)
-    found = finding("calql", values, f"BeT (E) {percent(bet.mean())}, GPT (D) {percent(gpt.mean())}: {100 * interval.value:+.1f} points",
-                    points(interval), judged(interval))
-    return replace(found, command=BOTH)
+    return replace(set_against("calql", bet, gpt, ("BeT (E)", "GPT (D)")), command=BOTH)
 
 
 # ---- the architecture of the critic (appendix F.5.1) -------------------------------------------------------------------
