@@ -29,6 +29,7 @@ from .rl.sac import SAC
 from .runs import Run
 from .seeds import training_seed
 from .tasks import get_task
+from .tasks.batched import load_physx_cuda, require_batched
 from .tasks.horizon import horizon_spec, shortened
 from .tasks.spec import TaskSpec
 from .tasks.vector import Episode, VectorEnv
@@ -45,6 +46,9 @@ class Trainer:
         self.config, self.base = dataclasses.replace(config, decorator=decorator), base.eval().to(config.device)
         # A spec of its own is for worlds outside the registry, such as the probes; with start_fraction both become a shorter task.
         self.spec = horizon_spec(spec or get_task(config.task), config.start_fraction)
+        if config.simulator == "physx_cuda":
+            require_batched(self.spec)
+            load_physx_cuda()
         if base.chunk != 1 and not self.chunks:
             raise PdkitError(f"{config.method} takes one action at a time, and this {base.kind} policy decides on {base.chunk} at once: "
                              "start from another one, or from the same with chunk=1.")
@@ -153,7 +157,7 @@ class Trainer:
         """
         c = self.config
         envs = VectorEnv(self.spec, c.num_envs, self._next_seed, window=self.base.window, chunk=self.base.chunk,
-                         workers=c.env_workers,
+                         workers=c.env_workers, simulator=c.simulator,
                          terminate_on_success=c.on_success == "terminate", success_tail=c.success_tail,
                          max_episode_steps=shortened(c.train_limit, c.start_fraction) or None)
         with envs, contextlib.closing(self._evaluations()) as evaluations:

@@ -9,6 +9,7 @@ from .decorator import DecoratorConfig
 from .errors import PdkitError, unknown
 from .methods.config import MethodConfig
 from .rl.sac import SACConfig
+from .tasks.vector import SIMULATORS
 
 WARMUPS = ("base", "uniform", "policy")
 SELECTIONS = ("last", "best")
@@ -46,14 +47,16 @@ class OnlineConfig:
     select: str = "best"  # the result: the last policy, or the best evaluated one since the gate was open (see Trainer._collect)
     log_every: int = 2_500
     checkpoint_every: int = 15_000
-    device: str = "cpu"
+    device: str = "cpu"  # where updates are made
+    simulator: str = "cpu"  # or physx_cuda, which simulates the lanes of training together on a GPU (pdkit/tasks/batched.py)
     method: str = "policy_decorator"  # see pdkit/methods
     method_config: MethodConfig = field(default_factory=MethodConfig)
     decorator: DecoratorConfig = field(default_factory=DecoratorConfig)
     sac: SACConfig = field(default_factory=SACConfig)
 
     def __post_init__(self):
-        for name, known in (("warmup", WARMUPS), ("select", SELECTIONS), ("on_success", ON_SUCCESS), ("bootstrap", BOOTSTRAPS)):
+        for name, known in (("warmup", WARMUPS), ("select", SELECTIONS), ("on_success", ON_SUCCESS), ("bootstrap", BOOTSTRAPS),
+                            ("simulator", SIMULATORS)):
             if getattr(self, name) not in known:
                 raise unknown(name, getattr(self, name), known)
         if not 0 <= self.demo_fraction < 1 or not 0 < self.gamma <= 1 or self.n_step < 1 or self.utd < 0 or self.batch < 2:

@@ -5,14 +5,19 @@ import torch
 from test_pixels import REACH, painted  # noqa: F401 (painted is a fixture)
 from worlds import reach_demos, reach_trainer
 
+from pdkit.errors import PdkitError
 from pdkit.evaluate import evaluate
 from pdkit.gradient_steps import GradientSteps, gradient_step, make_optimizer
 from pdkit.imitate import ImitateConfig, Windows, imitate
+from pdkit.online import Trainer
+from pdkit.online_config import OnlineConfig
 from pdkit.pixels.encoders import random_shift
 from pdkit.pixels.learn import HEADS, imitate_pixels
 from pdkit.pixels.pictures import draw, encoded
 from pdkit.policies import POLICIES, load_policy, save_policy
 from pdkit.probes import PROBES
+from pdkit.tasks import get_task
+from pdkit.tasks.batched import ManiSkillBatch, load_physx_cuda
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no CUDA device")
 
@@ -95,3 +100,46 @@ def test_the_decorator_learns_on_the_gpu_and_a_run_goes_on_there(method, changes
     trainers[1].agent.load(trainers[0].agent.state())
     for mine, theirs in zip(*(t.agent.actor.parameters() for t in trainers), strict=True):
         assert theirs.is_cuda and torch.equal(mine, theirs)
+
+
+@pytest.fixture
+def physx_cuda():
+    try:
+        load_physx_cuda()
+    except PdkitError as error:
+        pytest.skip(str(error))
+
+
+@pytest.mark.parametrize("task", ["StackCube", "PegInsertionSide"])
+def test_lanes_simulated_together_start_as_on_the_cpu_and_move_alike(physx_cuda, task):
+    spec, fast, seeds = get_task(task), get_task(task).make(), np.array([3, 4, 5, 6])
+    lanes, rng = ManiSkillBatch(spec, 4), np.random.default_rng(0)
+    try:
+        expected = np.stack([fast.reset(int(seed)) for seed in seeds])
+        np.testing.assert_allclose(lanes.reset(np.arange(4), seeds), expected, atol=1e-4)
+        chunks = rng.uniform(-1, 1, (5, 4, spec.act_dim)).astype(np.float32)
+        for actions in chunks:
+            observations, solved = lanes.step(actions)
+        assert not solved.any()
+        for lane, seed in enumerate(seeds):  # before anything is touched
+            fast.reset(int(seed))
+            for actions in chunks:
+                last, _ = fast.step(actions[lane])
+            np.testing.assert_allclose(observations[lane, :9], last[:9], atol=5e-3)
+        again = lanes.reset(np.array([1, 3]), np.array([4, 6]))  # two of them anew, each with the bodies that it was built with
+        np.testing.assert_allclose(again, expected[[1, 3]], atol=1e-4)
+        others = lanes.step(np.zeros((4, spec.act_dim), np.float32))[0][[0, 2]]
+        assert np.abs(others[:, :9] - expected[[0, 2], :9]).max() > 0.01  # and the others go on from where they were
+    finally:
+        lanes.close()
+        fast.close()
+
+
+def test_a_run_trains_on_lanes_simulated_together(physx_cuda):
+    spec = get_task("StackCube")
+    base = POLICIES["mlp"](dict(obs_dim=spec.obs_dim, act_dim=spec.act_dim, hidden=8))
+    config = OnlineConfig(task="StackCube", simulator="physx_cuda", num_envs=16, total_steps=1_600, warmup_steps=320, batch=64,
+                          demo_fraction=0.0, eval_every=0, train_limit=20, eval_workers=0, device="cuda")
+    trainer = Trainer(config, base)
+    trainer.train()
+    assert trainer.agent.updates > 200 and trainer.rows[-1]["train_length"] == 20

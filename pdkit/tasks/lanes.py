@@ -44,34 +44,49 @@ def close_spares() -> None:
             sim.close()
 
 
-class _Lane:
-    """One simulator with its episode bookkeeping; runs in the main process or in a worker."""
+class EpisodeCount:
+    """The bookkeeping of one lane's episode."""
 
-    def __init__(self, sim, limit: int, terminate_on_success: bool, success_tail: int):
-        self.sim, self.full_limit, self.terminate_on_success, self.success_tail = sim, limit, terminate_on_success, success_tail
-        self.seed, self.length, self.once, self.limit = IDLE, 0, False, limit
+    def __init__(self, limit: int, terminate_on_success: bool, success_tail: int):
+        self._full_limit, self._terminate_on_success, self._success_tail = limit, terminate_on_success, success_tail
+        self.begin(IDLE)
+
+    def begin(self, seed: int) -> None:
+        self.seed, self.length, self.once, self._limit = int(seed), 0, False, self._full_limit
+
+    def took(self, success: bool) -> tuple[bool, bool]:
+        """Count a primitive step, solved or not; whether with it the episode (terminated, was truncated)."""
+        self.length += 1
+        if success and not self.once:
+            self.once = True
+            if self._success_tail:
+                self._limit = min(self._limit, self.length + self._success_tail)
+        terminated = self._terminate_on_success and success
+        # Solving the task on the very last step is a termination, not a time-out.
+        return terminated, self.length >= self._limit and not terminated
+
+
+class _Lane:
+    """One simulator with its episode; runs in the main process or in a worker."""
+
+    def __init__(self, sim: Sim, *rules):
+        self.sim, self.episode = sim, EpisodeCount(*rules)
 
     def reset(self, seed: int) -> np.ndarray:
-        self.seed, self.length, self.once, self.limit = int(seed), 0, False, self.full_limit
-        return self.sim.reset(self.seed)
+        self.episode.begin(seed)
+        return self.sim.reset(self.episode.seed)
 
     def step(self, chunk: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool, bool]:
         """(observations after each primitive step taken, success at each, terminated, truncated)."""
-        observations, successes, terminated = [], [], False
+        observations, successes = [], []
         for action in chunk:
             observation, success = self.sim.step(action)
-            self.length += 1
-            if success and not self.once:
-                self.once = True
-                if self.success_tail:
-                    self.limit = min(self.limit, self.length + self.success_tail)
             observations.append(observation)
             successes.append(success)
-            terminated = self.terminate_on_success and success
-            if terminated or self.length >= self.limit:
+            terminated, truncated = self.episode.took(success)
+            if terminated or truncated:
                 break
-        # Solving the task on the very last step is a termination, not a time-out.
-        return np.stack(observations), np.array(successes), terminated, self.length >= self.limit and not terminated
+        return np.stack(observations), np.array(successes), terminated, truncated
 
 
 class _Lanes:
@@ -84,7 +99,7 @@ class _Lanes:
     def step(self, arrays: dict[str, np.ndarray]) -> None:
         for i, lane in enumerate(self.lanes):
             arrays["steps"][i] = 0
-            if lane.seed == IDLE:
+            if lane.episode.seed == IDLE:
                 continue
             observations, successes, terminated, truncated = lane.step(arrays["actions"][i])
             taken = len(observations)
@@ -92,7 +107,7 @@ class _Lanes:
             arrays["solved"][i, :taken], arrays["steps"][i] = successes, taken
             arrays["ended"][i] = (terminated, truncated)
             if terminated or truncated:
-                arrays["episode"][i] = (lane.seed, lane.length, lane.once, successes[-1])
+                arrays["episode"][i] = (lane.episode.seed, lane.episode.length, lane.episode.once, successes[-1])
                 self._start(lane, arrays, i, int(arrays["seeds"][i]))
 
     def reset(self, arrays: dict[str, np.ndarray]) -> None:
@@ -101,7 +116,7 @@ class _Lanes:
 
     def _start(self, lane: _Lane, arrays: dict[str, np.ndarray], i: int, seed: int) -> None:
         if seed == IDLE:
-            lane.seed = IDLE
+            lane.episode.begin(IDLE)
         else:
             arrays["first"][i] = lane.reset(seed)
 
@@ -110,7 +125,7 @@ class _Lanes:
         out = []
         for lane, (seed, actions) in zip(self.lanes, histories, strict=True):
             if seed == IDLE:
-                lane.seed = IDLE
+                lane.episode.begin(IDLE)
                 out.append(np.zeros((0,), np.float32))
                 continue
             observations = [lane.reset(seed)]

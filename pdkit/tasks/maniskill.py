@@ -78,25 +78,26 @@ class StockSim:
         self._env = self.fast.build(render)
         self._can_render = render
 
-    def _with_base_pose(self, observation: Any) -> np.ndarray:
-        values = observation[0].numpy()
-        base = self._env.agent.robot.pose.raw_pose[0].numpy()
-        at = BASE_POSE.start
-        return np.concatenate([values[:at], base, values[at:]], dtype=np.float32)
-
     def reset(self, seed: int) -> np.ndarray:
         with building(self._can_render):  # some tasks load their scene anew
-            return self._with_base_pose(self._env.reset(seed=seed)[0])
+            return with_base_pose(self._env, self._env.reset(seed=seed)[0])[0]
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, bool]:
-        observation, _, _, _, info = self._env.step(_clipped(action))
-        return self._with_base_pose(observation), bool(info["success"][0])
+        observations, _, _, _, info = self._env.step(_clipped(action))
+        return with_base_pose(self._env, observations)[0], bool(info["success"][0])
 
     def render(self) -> np.ndarray:
         return _picture(self._env, self._can_render)
 
     def close(self) -> None:
         self._env.close()
+
+
+def with_base_pose(env: Any, observations: Any) -> np.ndarray:
+    """A stock environment's observations, torch (N, D), with the robot's base pose put back: numpy (N, D + 7)."""
+    values, base = observations.cpu().numpy(), env.agent.robot.pose.raw_pose.cpu().numpy()
+    at = BASE_POSE.start
+    return np.concatenate([values[:, :at], base, values[:, at:]], axis=1, dtype=np.float32)
 
 
 def building(can_render: bool) -> AbstractContextManager:

@@ -99,11 +99,12 @@ Camera = tuple[tuple[float, float, float], tuple[float, float, float]]  # where 
 
 
 def make_env(env_id: str, control_mode: str, camera: Camera | None = None, **kwargs: Any) -> Any:
-    """A stock ManiSkill 3 environment, unwrapped (no time limit): CPU physics, state observations, sparse reward.
+    """A stock ManiSkill 3 environment, unwrapped (no time limit): state observations, sparse reward, and CPU physics unless
+    `sim_backend` says otherwise.
 
     With a `camera` it can also draw what that sees (seconds to build); raises PdkitError where nothing can be drawn.
     """
-    options = dict(obs_mode="state", reward_mode="sparse", control_mode=control_mode, sim_backend="cpu")
+    options = dict(obs_mode="state", reward_mode="sparse", control_mode=control_mode, sim_backend="cpu") | kwargs
     device = require_rendering() if camera else None
     with quiet():
         import gymnasium
@@ -113,6 +114,6 @@ def make_env(env_id: str, control_mode: str, camera: Camera | None = None, **kwa
         if camera:
             view = dict(width=PICTURE, height=PICTURE, pose=look_at(*camera))
             drawing = dict(render_backend=device, render_mode="rgb_array", human_render_camera_configs=view)
-            return gymnasium.make(env_id, **options, **drawing, **kwargs).unwrapped
+            return gymnasium.make(env_id, **options, **drawing).unwrapped
         with without_materials():
-            return gymnasium.make(env_id, render_backend="none", **options, **kwargs).unwrapped
+            return gymnasium.make(env_id, render_backend="none", **options).unwrapped

@@ -12,9 +12,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ..errors import PdkitError
+from ..errors import PdkitError, unknown
 from .lanes import IDLE, InProcess, Workers
 from .spec import TaskSpec
+
+SIMULATORS = ("cpu", "physx_cuda")
 
 
 @dataclass(frozen=True)
@@ -64,10 +66,14 @@ class VectorEnv:
         terminate_on_success: end an episode when solved (training); otherwise it runs to the time limit.
         success_tail: without termination, end an episode (as a time limit) this many steps after its first success; 0: never.
         max_episode_steps: another limit than the task's.
+        simulator: "cpu", or "physx_cuda": all lanes in one scene on a GPU, without workers (see batched.py for what differs).
     """
 
     def __init__(self, spec: TaskSpec, num_envs: int, next_seed: Callable[[int], int], *, window: int = 1, chunk: int = 1,
-                 workers: int = 0, terminate_on_success: bool = False, success_tail: int = 0, max_episode_steps: int | None = None):
+                 workers: int = 0, terminate_on_success: bool = False, success_tail: int = 0, max_episode_steps: int | None = None,
+                 simulator: str = "cpu"):
+        if simulator not in SIMULATORS:
+            raise unknown("simulator", simulator, SIMULATORS)
         if num_envs < 1 or workers < 0 or window < 1 or chunk < 1:
             raise PdkitError("A vectorised environment needs num_envs, window and chunk >= 1 and workers >= 0.")
         self.spec, self.num_envs, self.window, self.chunk = spec, num_envs, window, chunk
@@ -80,9 +86,15 @@ class VectorEnv:
             "solved": ((num_envs, chunk), np.bool_), "steps": ((num_envs,), np.int64), "ended": ((num_envs, 2), np.bool_),
             "episode": ((num_envs, 4), np.int64),
         }
-        arguments = (spec, self.limit, terminate_on_success, success_tail)
-        self._backend = Workers(shapes, num_envs, min(workers, num_envs), arguments) if workers else \
-            InProcess(shapes, num_envs, arguments)
+        rules = (self.limit, terminate_on_success, success_tail)
+        if simulator == "physx_cuda":
+            from .batched import ManiSkillBatch, Together  # not above: it needs ManiSkill's tasks, and few ask for it
+
+            self._backend = Together(shapes, ManiSkillBatch(spec, num_envs), rules)
+        elif workers:
+            self._backend = Workers(shapes, num_envs, min(workers, num_envs), (spec, *rules))
+        else:
+            self._backend = InProcess(shapes, num_envs, (spec, *rules))
         self._arrays = self._backend.arrays
         self._windows = np.zeros((num_envs, window, spec.obs_dim), np.float32)
         self._upcoming = np.full(num_envs, IDLE, np.int64)

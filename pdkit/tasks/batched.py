@@ -1,0 +1,208 @@
+"""Lanes that share one simulation: `physx_cuda`, where ManiSkill steps all lanes of a task together on an NVIDIA GPU.
+
+Here it is stock ManiSkill that steps, not the fast step of maniskill.py. What differs for a user:
+
+- Physics on a GPU does not repeat bit for bit, so neither does a training run, and a restored checkpoint puts lanes only nearly
+  where they were. Evaluations therefore stay with the fast step on the CPU, which does repeat.
+- An episode starts where the fast step starts it for the same seed, but bodies cannot be built while the GPU simulates: a lane of
+  PegInsertionSide keeps the peg and the box of its first episode, and only where they lie changes.
+"""
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Protocol
+from zipfile import BadZipFile
+
+import numpy as np
+
+from ..errors import PdkitError
+from .lanes import IDLE, EpisodeCount
+from .maniskill import building, with_base_pose
+from .maniskill_headless import make_env, quiet
+from .peg import PegInsertionSide, peg_start
+from .spec import TaskSpec
+from .stack_cube import StackCube, stack_cube_start
+
+Start = tuple[np.ndarray, dict[str, np.ndarray]]  # joint positions (9,), and poses (7,) of bodies by ManiSkill's names
+
+
+class BatchSim(Protocol):
+    """N simulated worlds that take every step together; without time limit, reward or autoreset, as `Sim`."""
+
+    def reset(self, lanes: np.ndarray, seeds: np.ndarray) -> np.ndarray:
+        """Start the episodes that `seeds` (k,) name in `lanes` (k,); observations (k, obs_dim)."""
+
+    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """One primitive step of all lanes with actions (N, act_dim); (observations (N, obs_dim), success at this step (N,))."""
+
+    def close(self) -> None: ...
+
+
+def _stack_cube(seed: int, built: int) -> Start:
+    joints, red, green = stack_cube_start(seed)
+    return joints, {"cubeA": red, "cubeB": green}
+
+
+def _peg(seed: int, built: int) -> Start:
+    start, bodies = peg_start(seed), peg_start(built)
+    peg, box = start.peg.copy(), start.box.copy()
+    peg[2], box[2] = bodies.radius, bodies.half_length  # both lie on the table
+    return start.joints, {"peg": peg, "box_with_hole": box}
+
+
+# Where the episode of a seed starts in a lane that was built for another seed.
+STARTS: dict[Callable[..., Any], Callable[[int, int], Start]] = {StackCube: _stack_cube, PegInsertionSide: _peg}
+
+
+class ManiSkillBatch:
+    """A task through ManiSkill's own step, all lanes in one scene; a `BatchSim`.
+
+    Args:
+        spec: StackCube or PegInsertionSide as they are in the registry.
+        num_envs: N.
+        backend: ManiSkill's name of what simulates. "physx_cpu" takes one lane: so the tests compare it with the fast step.
+
+    Raises PdkitError for another task, and where there is no CUDA device or no PhysX library for it.
+    """
+
+    def __init__(self, spec: TaskSpec, num_envs: int, backend: str = "physx_cuda"):
+        require_batched(spec)
+        if backend == "physx_cuda":
+            load_physx_cuda()
+        self._start = STARTS[spec.make]
+        self._env = make_env(spec.make.env_id, spec.make.control, sim_backend=backend, num_envs=num_envs, reconfiguration_freq=0)
+        self._built: list[int] = []  # the seed that each lane was built for
+
+    def reset(self, lanes: np.ndarray, seeds: np.ndarray) -> np.ndarray:
+        import torch
+
+        if not self._built:
+            known = dict(zip(lanes.tolist(), seeds.tolist(), strict=True))
+            self._built = [known.get(lane, 0) for lane in range(self._env.num_envs)]
+            with building(False):
+                self._env.reset(seed=self._built, options={"reconfigure": True})
+        # Starts are given as states, because ManiSkill draws those of all lanes from the first one's seed.
+        starts = [self._start(int(seed), self._built[lane]) for lane, seed in zip(lanes, seeds, strict=True)]
+        robot, still = self._env.agent.robot, np.zeros((len(starts), 6))
+        joints = np.stack([joints for joints, _ in starts])
+        states = {
+            "actors": {name: self._tensor([bodies[name] for _, bodies in starts], still) for name in starts[0][1]},
+            "articulations": {robot.name: self._tensor(robot.pose.raw_pose.cpu().numpy()[lanes], still, joints, 0 * joints)},
+        }
+        options = {"env_idx": torch.as_tensor(lanes, device=self._env.device), "reset_to_env_states": {"env_states": states}}
+        return with_base_pose(self._env, self._env.reset(options=options)[0])[lanes]
+
+    def _tensor(self, *columns: Any) -> Any:
+        import torch
+
+        return torch.from_numpy(np.hstack(columns).astype(np.float32)).to(self._env.device)
+
+    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        observations, _, _, _, info = self._env.step(self._tensor(actions))
+        return with_base_pose(self._env, observations), info["success"].cpu().numpy()
+
+    def close(self) -> None:
+        self._env.close()
+
+
+def require_batched(spec: TaskSpec) -> None:
+    """Raises PdkitError for a task that ManiSkill cannot simulate in a batch: not a stock one, or one that was changed."""
+    if spec.make not in STARTS:
+        raise PdkitError(f"physx_cuda simulates {' and '.join(task.__name__ for task in STARTS)}, whole episodes with states as "
+                         f"observations, and not {spec.name} as it is set up here; set simulator=cpu.")
+
+
+def load_physx_cuda() -> None:
+    """Load SAPIEN's PhysX library for CUDA, which SAPIEN fetches when it is first needed. Raises PdkitError where that fails."""
+    import torch
+
+    if not torch.cuda.is_available():
+        raise PdkitError("physx_cuda needs a CUDA device, and none was found; set simulator=cpu, or check the driver with `pdkit doctor`.")
+    with quiet():
+        from sapien import physx
+    try:
+        physx.enable_gpu()
+    except (OSError, BadZipFile, RuntimeError) as error:  # no network is an OSError too
+        folder = Path.home() / ".sapien" / "physx" / physx.version()
+        raise PdkitError(f"SAPIEN's PhysX library for CUDA could not be loaded ({error}): unzip the one for this system from GitHub, "
+                         f"sapien-sim/physx-precompiled, release {physx.version()}, into {folder}, or set simulator=cpu.") from None
+
+
+class Together:
+    """Lanes of one `BatchSim`, behind the same methods as InProcess and Workers (lanes.py).
+
+    Every primitive step is all lanes' at once: a lane without an episode, or one whose episode ended before its chunk did, is
+    stepped along and not looked at.
+    """
+
+    def __init__(self, shapes, sim: BatchSim, rules: tuple):
+        self.arrays = {name: np.zeros(shape, dtype) for name, (shape, dtype) in shapes.items()}
+        self._sim, self._episodes, self._pending = sim, [EpisodeCount(*rules) for _ in self.arrays["steps"]], ""
+
+    def send(self, command: str) -> None:
+        self._pending = command
+
+    def receive(self) -> None:
+        getattr(self, self._pending)()
+
+    def call(self, command: str) -> None:
+        getattr(self, command)()
+
+    def reset(self) -> None:
+        self._begin(np.arange(len(self._episodes)))
+
+    def step(self) -> None:
+        arrays = self.arrays
+        going = np.array([episode.seed != IDLE for episode in self._episodes])
+        arrays["steps"][:] = 0
+        for k in range(arrays["actions"].shape[1]):
+            if not going.any():
+                break
+            observations, solved = self._sim.step(arrays["actions"][:, k])
+            for i in np.flatnonzero(going):
+                episode = self._episodes[i]
+                arrays["observations"][i, k], arrays["solved"][i, k], arrays["steps"][i] = observations[i], solved[i], k + 1
+                arrays["ended"][i] = episode.took(bool(solved[i]))
+                if arrays["ended"][i].any():
+                    arrays["episode"][i] = (episode.seed, episode.length, episode.once, solved[i])
+                    going[i] = False
+        self._begin(np.flatnonzero(arrays["ended"].any(axis=1) & (arrays["steps"] > 0)))
+
+    def _begin(self, lanes: np.ndarray) -> None:
+        """Start the episodes that the seeds name in these lanes, or leave them idle."""
+        for lane in lanes:
+            self._episodes[lane].begin(self.arrays["seeds"][lane])
+        lanes = lanes[self.arrays["seeds"][lanes] != IDLE]
+        if len(lanes):
+            self.arrays["first"][lanes] = self._sim.reset(lanes, self.arrays["seeds"][lanes])
+
+    def replay(self, histories: list[tuple[int, np.ndarray]]) -> list[np.ndarray]:
+        """As `_Lanes.replay`. All lanes arrive at the same step, so one with a shorter history starts later."""
+        seeds = np.array([seed for seed, _ in histories], np.int64)
+        lengths = np.array([len(actions) for _, actions in histories])
+        longest = lengths.max()
+        self.arrays["seeds"][:] = seeds
+        self.reset()
+        out: list[list[np.ndarray]] = [[] for _ in histories]
+        for step in range(longest + 1):
+            first = np.flatnonzero((lengths == longest - step) & (seeds != IDLE))
+            if step:
+                self._begin(first)
+            for i in first:
+                out[i].append(self.arrays["first"][i].copy())
+            if step == longest:
+                break
+            at = step - (longest - lengths)  # where each lane stands in its history; below 0: not yet begun
+            going = np.flatnonzero((at >= 0) & (seeds != IDLE))
+            actions = np.zeros_like(self.arrays["actions"][:, 0])
+            actions[going] = [histories[i][1][at[i]] for i in going]
+            observations, solved = self._sim.step(actions)
+            for i in going:
+                self._episodes[i].took(bool(solved[i]))
+                out[i].append(observations[i])
+        return [np.stack(observations) if observations else np.zeros((0,), np.float32) for observations in out]
+
+    def close(self, keep: bool) -> None:
+        """End the simulation; it is not kept."""
+        self._sim.close()

@@ -1,0 +1,212 @@
+"""Lanes that share one simulation: the bookkeeping against separate lanes, and ManiSkill's batched step against the fast step.
+
+ManiSkill simulates one lane on a CPU; what takes several of its lanes is in test_cuda.py.
+"""
+import dataclasses
+import functools
+
+import numpy as np
+import pytest
+import torch
+from test_vector import COUNT, CountSim
+
+from pdkit.errors import PdkitError
+from pdkit.online import Trainer
+from pdkit.online_config import OnlineConfig
+from pdkit.policies import POLICIES
+from pdkit.profiles import flat
+from pdkit.runs import Run
+from pdkit.tasks import batched, get_task
+from pdkit.tasks.batched import ManiSkillBatch
+from pdkit.tasks.horizon import horizon_spec
+from pdkit.tasks.lanes import IDLE
+from pdkit.tasks.peg import peg_start
+from pdkit.tasks.vector import VectorEnv
+
+
+class SideBySide:
+    """A BatchSim of separate simulators."""
+
+    def __init__(self, spec, num_envs):
+        self.sims = [spec.make() for _ in range(num_envs)]
+
+    def reset(self, lanes, seeds):
+        return np.stack([self.sims[lane].reset(int(seed)) for lane, seed in zip(lanes, seeds, strict=True)])
+
+    def step(self, actions):
+        results = [sim.step(action) for sim, action in zip(self.sims, actions, strict=True)]
+        return np.stack([observation for observation, _ in results]), np.array([solved for _, solved in results])
+
+    def close(self):
+        for sim in self.sims:
+            sim.close()
+
+
+@pytest.fixture
+def side_by_side(monkeypatch):
+    monkeypatch.setattr(batched, "ManiSkillBatch", SideBySide)
+
+
+def both(spec, num_envs, queue_of, **rules):
+    """The same lanes apart and together."""
+    return [VectorEnv(spec, num_envs, queue_of(), simulator=simulator, **rules) for simulator in ("cpu", "physx_cuda")]
+
+
+def endless():
+    """Seeds without end, other ones for every lane."""
+    counts = [0, 0, 0]
+
+    def next_seed(lane):
+        counts[lane] += 1
+        return 100 * lane + counts[lane]
+    return next_seed
+
+
+def scarce():
+    """Four episodes for three lanes, so that lanes become idle."""
+    queue = [4, 3, 2, 1]
+    return lambda lane: queue.pop() if queue else IDLE
+
+
+def same(one, other):
+    live = one.steps > 0
+    return all(np.array_equal(getattr(one, name)[live], getattr(other, name)[live]) for name in
+               ("windows", "final_windows", "solved", "terminated", "truncated")) and \
+        np.array_equal(one.steps, other.steps) and one.episodes == other.episodes
+
+
+@pytest.mark.parametrize("rules", [{}, {"chunk": 3}, {"chunk": 3, "terminate_on_success": True}, {"success_tail": 2},
+                                   {"chunk": 2, "window": 3, "success_tail": 1}])
+@pytest.mark.parametrize("seeds", [endless, scarce])
+def test_lanes_together_report_what_lanes_apart_report(side_by_side, rules, seeds):
+    rng, finished = np.random.default_rng(0), 0
+    apart, together = both(COUNT, 3, seeds, **rules)
+    with apart, together:
+        assert np.array_equal(apart.reset(), together.reset())
+        for _ in range(30):
+            actions = rng.uniform(-1, 0.3, (3, rules.get("chunk", 1), 1))
+            one, other = apart.step(actions), together.step(actions)
+            assert same(one, other)
+            finished += len(one.episodes)
+    assert finished >= 4
+
+
+def test_together_a_real_task_is_the_same_to_the_last_bit(side_by_side):
+    rng = np.random.default_rng(0)
+    apart, together = both(get_task("StackCube"), 2, endless, chunk=2, window=2, max_episode_steps=5)
+    with apart, together:
+        assert np.array_equal(apart.reset(), together.reset())
+        for _ in range(8):
+            actions = rng.uniform(-1, 1, (2, 2, 4))
+            assert same(apart.step(actions), together.step(actions))
+
+
+class AccountSim(CountSim):
+    """As CountSim, but its observation sums up the actions, so that a replay that mixes lanes or steps up is seen."""
+
+    def reset(self, seed):
+        self.sum = np.float32(seed)
+        return np.array([super().reset(seed)[0], self.sum], np.float32)
+
+    def step(self, action):
+        _, solved = super().step(action)
+        self.sum = self.sum * np.float32(0.5) + action[0]
+        return np.array([self.seed, self.sum], np.float32), solved
+
+
+def test_a_snapshot_brings_lanes_of_different_ages_back(side_by_side):
+    spec = dataclasses.replace(COUNT, make=AccountSim, max_episode_steps=5)
+    rng, ages = np.random.default_rng(1), set()
+    for steps in range(1, 8):
+        first = VectorEnv(spec, 3, endless(), terminate_on_success=True, window=3, simulator="physx_cuda")
+        with first, VectorEnv(spec, 3, endless(), terminate_on_success=True, window=3, simulator="physx_cuda") as second:
+            first.reset()
+            for _ in range(steps):
+                first.step(rng.uniform(-1, 0.7, (3, 1, 1)))
+            snapshot = first.snapshot()
+            ages.add(tuple(snapshot["lengths"] == snapshot["lengths"].max()))
+            assert np.array_equal(second.restore(snapshot), first._windows)
+            first._next_seed = second._next_seed = lambda lane: 7 + lane
+            for _ in range(6):
+                actions = rng.uniform(-1, 0.7, (3, 1, 1))
+                assert same(first.step(actions), second.step(actions))
+    assert len(ages) > 2  # of which some began later than others
+
+
+@pytest.mark.parametrize("task, tolerance", [("StackCube", 1e-4), ("PegInsertionSide", 5e-3)])
+def test_maniskills_batched_step_starts_and_moves_as_the_fast_step(task, tolerance):
+    spec, rng = get_task(task), np.random.default_rng(0)
+    stock, fast = ManiSkillBatch(spec, 1, "physx_cpu"), spec.make()
+    try:
+        for _ in range(2):  # the second time without building the scene anew
+            np.testing.assert_allclose(stock.reset(np.array([0]), np.array([7]))[0], fast.reset(7), atol=1e-6)
+            for _ in range(30):
+                action = rng.uniform(-1, 1, spec.act_dim).astype(np.float32)
+                (observations, solved), (expected, success) = stock.step(action[None]), fast.step(action)
+                np.testing.assert_allclose(observations[0], expected, atol=tolerance)
+                assert bool(solved[0]) == success
+    finally:
+        stock.close()
+        fast.close()
+
+
+def test_a_lane_keeps_the_peg_that_it_was_built_with_where_another_episode_lies():
+    spec = get_task("PegInsertionSide")
+    stock, fast = ManiSkillBatch(spec, 1, "physx_cpu"), spec.make()
+    try:
+        stock.reset(np.array([0]), np.array([7]))
+        observation, expected = stock.reset(np.array([0]), np.array([11]))[0], fast.reset(11)
+    finally:
+        stock.close()
+        fast.close()
+    built = peg_start(7)
+    np.testing.assert_allclose(observation[:34], expected[:34], atol=1e-6)  # the arm, and where the peg lies on the table
+    np.testing.assert_allclose(observation[34], built.radius, atol=1e-6)  # on the table, neither in nor above it
+    np.testing.assert_allclose(observation[39:42], [built.half_length, built.radius, built.radius], atol=1e-6)
+
+
+def test_a_run_trains_on_the_batched_step_and_resumes(monkeypatch, tmp_path):
+    """The whole loop on the one lane that ManiSkill simulates on a CPU."""
+    monkeypatch.setattr(batched, "ManiSkillBatch", functools.partial(ManiSkillBatch, backend="physx_cpu"))
+    monkeypatch.setattr("pdkit.online.load_physx_cuda", lambda: None)
+    spec = get_task("StackCube")
+    torch.manual_seed(0)
+    base = POLICIES["mlp"](dict(obs_dim=spec.obs_dim, act_dim=spec.act_dim, hidden=8))
+    config = OnlineConfig(task="StackCube", simulator="physx_cuda", num_envs=1, env_workers=1, eval_workers=0, total_steps=120,
+                          warmup_steps=40, batch=16, utd=0.1, demo_fraction=0.0, eval_every=0, log_every=40, train_limit=30,
+                          checkpoint_every=50)
+
+    def killed(trainer):
+        if trainer.step >= 80:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        Trainer(config, base).train(Run(tmp_path, "online", flat(config)), killed)
+    trainer = Trainer(config, base)
+    trainer.train(Run(tmp_path, "online", flat(config)))
+    assert [row["step"] for row in trainer.rows] == [40, 80, 120] and trainer.agent.updates >= 7
+    assert all(row["train_length"] == 30 for row in trainer.rows)
+
+
+def test_what_cannot_be_simulated_together_is_refused_with_what_to_do():
+    stack, peg = get_task("StackCube"), get_task("PegInsertionSide")
+    for spec in (get_task("Door"), get_task("TurnFaucet"), horizon_spec(stack, 0.5)):
+        with pytest.raises(PdkitError, match="physx_cuda simulates StackCube and PegInsertionSide.*set simulator=cpu"):
+            VectorEnv(spec, 2, endless(), simulator="physx_cuda")
+    with pytest.raises(PdkitError, match="Unknown simulator 'physx'"):
+        OnlineConfig(simulator="physx")
+    if not torch.cuda.is_available():
+        with pytest.raises(PdkitError, match="needs a CUDA device.*set simulator=cpu"):
+            VectorEnv(peg, 2, endless(), simulator="physx_cuda")
+
+
+def test_a_missing_physx_library_is_one_sentence(monkeypatch):
+    from sapien import physx
+
+    def fails():
+        raise OSError("no network")
+
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(physx, "enable_gpu", fails)
+    with pytest.raises(PdkitError, match="no network.*sapien-sim/physx-precompiled.*set simulator=cpu"):
+        batched.load_physx_cuda()
