@@ -2,11 +2,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from .errors import PdkitError
+from .seeds import own_random_numbers, selection_seeds
 from .smoothness import Motions
 from .tasks.lanes import IDLE
 from .tasks.spec import TaskSpec
@@ -57,3 +59,16 @@ def evaluate(spec: TaskSpec, actor: Actor, seeds: Sequence[int], *, window: int 
             if result.episodes and progress:
                 progress(len(rows), len(seeds))
     return pd.DataFrame([rows[s] for s in seeds])
+
+
+def selection_scores(spec: TaskSpec, policy: Any, episodes: int, seed: int, num_envs: int = 10) -> dict[str, float]:
+    """success_once and success_at_end of a policy on the first `episodes` selection seeds; nothing without episodes.
+
+    Random numbers that the policy draws follow from `seed`, and training goes on with its own.
+    """
+    if not episodes:
+        return {}
+    with own_random_numbers():
+        policy.reset(seed)
+        table = evaluate(spec, policy.act, selection_seeds(episodes), window=policy.window, chunk=policy.chunk, num_envs=num_envs)
+    return {"success_once": float(table.success_once.mean()), "success_at_end": float(table.success_at_end.mean())}

@@ -7,6 +7,7 @@ import math
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,10 +15,9 @@ from torch import nn
 
 from .demos.format import Demos
 from .errors import PdkitError, unknown
-from .evaluate import evaluate
+from .evaluate import selection_scores
 from .gradient_steps import GradientSteps, make_optimizer
 from .policies import POLICIES, Policy
-from .seeds import own_random_numbers, selection_seeds
 from .tasks import get_task
 from .tasks.spec import TaskSpec
 
@@ -137,7 +137,7 @@ class Average:
             self._ema.restore(self._parameters)
 
 
-def checkpoint_row(iteration: int, started: float, terms: dict[str, torch.Tensor], lr: float) -> dict[str, float]:
+def _checkpoint_row(iteration: int, started: float, terms: dict[str, torch.Tensor], lr: float) -> dict[str, float]:
     """iteration, seconds since `started` and the loss terms. Raises PdkitError for a loss that is no number."""
     row = {"iteration": iteration, "seconds": time.monotonic() - started, **{k: float(v.detach()) for k, v in terms.items()}}
     if not np.isfinite(row["loss"]):
@@ -164,44 +164,52 @@ def imitate(kind: str, demos: Demos, config: ImitateConfig | None = None, policy
     if not policy.learns:
         started = time.monotonic()
         policy.remember(*windows.all())
-        row = {"iteration": 0, "seconds": time.monotonic() - started} | selection_scores(spec, policy, config)
+        row = {"iteration": 0, "seconds": time.monotonic() - started} | selection_scores(spec, policy, config.eval_episodes, config.seed)
         if progress:
             progress(row)
         return policy.eval(), [row]
     optimizer = make_optimizer(policy, config, device=device)
     step = GradientSteps(policy.loss, optimizer, device, config.bf16)
     windows.to(device)
-    rates = torch.optim.lr_scheduler.LambdaLR(optimizer, config.lr_factor)
     average = Average(policy.parameters(), config.ema_power)
-    history, best, best_state, started = [], -1.0, None, time.monotonic()
-    for iteration in range(1, config.iterations + 1):
+
+    def batch() -> tuple[torch.Tensor, ...]:
         observations, actions = windows.sample(config.batch, generator)
-        terms = step(observations, actions, *(x.to(device) for x in policy.draw(actions.shape)))
+        return observations, actions, *(x.to(device) for x in policy.draw(actions.shape))
+
+    def candidate() -> tuple[dict[str, torch.Tensor], dict[str, float]]:
+        scores = selection_scores(spec, policy.eval(), config.eval_episodes, config.seed)
+        policy.train()
+        return {k: v.clone() for k, v in policy.state_dict().items()}, scores
+
+    best, history = best_checkpoint(config, lambda: step(*batch()), optimizer, average, candidate, progress)
+    policy.load_state_dict(best)
+    return policy.eval(), history
+
+
+def best_checkpoint(config: ImitateConfig, step: Callable[[], dict[str, torch.Tensor]], optimizer: torch.optim.Optimizer, average: Average,
+                    candidate: Callable[[], tuple[Any, dict[str, float]]], progress: Callable[[dict], None] | None
+                    ) -> tuple[Any, list[dict]]:
+    """Make `config.iterations` gradient steps; the best candidate by its success_once (without evaluations the latest), and one row
+    a checkpoint. `step` makes a gradient step and gives its loss terms; `candidate` gives what may be chosen, and its scores, and is
+    called while the weights are the averaged ones. Raises PdkitError for a loss that is no number.
+    """
+    rates = torch.optim.lr_scheduler.LambdaLR(optimizer, config.lr_factor)
+    history, best, chosen, started = [], -1.0, None, time.monotonic()
+    for iteration in range(1, config.iterations + 1):
+        terms = step()
         rates.step()
         average.step()
         if iteration % config.eval_every and iteration < config.iterations:
             continue
-        row = checkpoint_row(iteration, started, terms, config.lr)
-        score = float(iteration)  # without evaluations the latest wins
+        row = _checkpoint_row(iteration, started, terms, config.lr)
         with average.in_place():
-            if config.eval_episodes:
-                row |= selection_scores(spec, policy.eval(), config)
-                score = row["success_once"]
-                policy.train()
-            if score > best:
-                best, best_state = score, {k: v.clone() for k, v in policy.state_dict().items()}
+            it, scores = candidate()
+        row |= scores
+        score = scores.get("success_once", float(iteration))
+        if score > best:
+            best, chosen = score, it
         history.append(row)
         if progress:
             progress(row)
-    policy.load_state_dict(best_state)
-    return policy.eval(), history
-
-
-def selection_scores(spec: TaskSpec, policy: Policy, config: ImitateConfig) -> dict[str, float]:
-    """Success on the selection seeds; nothing without episodes."""
-    if not config.eval_episodes:
-        return {}
-    with own_random_numbers():
-        policy.reset(config.seed)
-        table = evaluate(spec, policy.act, selection_seeds(config.eval_episodes), window=policy.window, chunk=policy.chunk)
-    return {"success_once": float(table.success_once.mean()), "success_at_end": float(table.success_at_end.mean())}
+    return chosen, history

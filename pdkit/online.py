@@ -302,6 +302,8 @@ class Trainer:
         arrays = {f"envs.{k}": v for k, v in snapshot.items()} | {f"nstep.{k}": v for k, v in self.nstep.state().items()}
         arrays |= {"replay": self.replay.rows[: self.replay.size].cpu().numpy(), "episode_counts": np.array(self.episode_counts),
                    "generator": self.generator.get_state().numpy(), "torch_rng": torch.get_rng_state().numpy()}
+        if self.config.device == "cuda":  # which has a generator of its own: dropout and sampling draw from it
+            arrays["cuda_rng"] = torch.cuda.get_rng_state().numpy()
         agent = self.agent.state()
         self._must_be_finite({name: float(tensor.float().sum()) for name, tensor in agent.items()})
         arrays |= {f"agent.{k}": v.numpy() for k, v in agent.items()}
@@ -326,6 +328,8 @@ class Trainer:
         self.nstep.load(group("nstep"), self.stored_dim, self.act_dim)
         self.generator.set_state(torch.from_numpy(arrays["generator"]))
         torch.set_rng_state(torch.from_numpy(arrays["torch_rng"]))
+        if self.config.device == "cuda":
+            torch.cuda.set_rng_state(torch.from_numpy(arrays["cuda_rng"]))
         self.rng.bit_generator.state = values["rng"]
         self.episode_counts = arrays["episode_counts"].tolist()
         self.step, self.train_seconds, self.rows = values["step"], values["train_seconds"], values["rows"]

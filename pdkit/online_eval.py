@@ -14,9 +14,8 @@ from torch import nn
 
 from .decorated import Decorated
 from .errors import PdkitError
-from .evaluate import evaluate
+from .evaluate import selection_scores
 from .policies import Policy
-from .seeds import own_random_numbers, selection_seeds
 from .tasks.spec import TaskSpec
 from .torch_setup import set_threads
 
@@ -98,11 +97,7 @@ class Evaluations:
 def _score(spec: TaskSpec, policy: Policy | Decorated, actor: nn.Module, episodes: int, seed: int, weights: State) -> dict[str, float]:
     started = time.monotonic()
     actor.load_state_dict(weights)
-    with own_random_numbers():
-        policy.reset(seed)
-        table = evaluate(spec, policy.act, selection_seeds(episodes), window=policy.window, chunk=policy.chunk, num_envs=LANES)
-    return {"success_once": float(table.success_once.mean()), "success_at_end": float(table.success_at_end.mean()),
-            "eval_seconds": time.monotonic() - started}
+    return selection_scores(spec, policy, episodes, seed, LANES) | {"eval_seconds": time.monotonic() - started}
 
 
 def _worker(pipe, arguments) -> None:

@@ -106,7 +106,7 @@ def test_the_selected_checkpoint_is_the_one_that_is_tested(monkeypatch):
     config = SMALL["MLP"].settings(3, 8, seed=1)
     scores, kept = iter([0.25, 0.75, 0.5]), {}
 
-    def told(spec, policy, config):
+    def told(spec, policy, episodes, seed):
         kept[len(kept)] = {k: v.clone() for k, v in policy.state_dict().items()}
         return {"success_once": next(scores), "success_at_end": 0.0}
 

@@ -15,7 +15,9 @@ from pdkit.pixels.encoders import random_shift
 from pdkit.pixels.learn import HEADS, imitate_pixels
 from pdkit.pixels.pictures import draw, encoded
 from pdkit.policies import POLICIES, load_policy, save_policy
-from pdkit.probes import PROBES
+from pdkit.probes import PROBES, biased_base
+from pdkit.profiles import flat
+from pdkit.runs import Run
 from pdkit.tasks import get_task
 from pdkit.tasks.batched import ManiSkillBatch, load_physx_cuda
 
@@ -143,3 +145,15 @@ def test_a_run_trains_on_lanes_simulated_together(physx_cuda):
     trainer = Trainer(config, base)
     trainer.train()
     assert trainer.agent.updates > 200 and trainer.rows[-1]["train_length"] == 20
+
+
+def test_a_checkpoint_holds_the_random_numbers_of_the_gpu(tmp_path):
+    trained, resumed = (reach_trainer("policy_decorator", biased_base(), device="cuda", total_steps=600) for _ in range(2))
+    run = Run(tmp_path, "online", flat(trained.config))
+    trained.train()
+    torch.cuda.manual_seed(3)
+    trained.save(run, {}, {})
+    expected = torch.rand(5, device="cuda")
+    torch.cuda.manual_seed(4)
+    resumed.load(run)
+    assert torch.equal(torch.rand(5, device="cuda"), expected)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-import time
 from collections.abc import Callable
 from typing import Any
 
@@ -18,8 +17,9 @@ from torch import nn
 
 from ..demos.format import Demos
 from ..errors import PdkitError
+from ..evaluate import selection_scores
 from ..gradient_steps import GradientSteps, make_optimizer
-from ..imitate import Average, ImitateConfig, Windows, checkpoint_row, selection_scores
+from ..imitate import Average, ImitateConfig, Windows, best_checkpoint
 from ..policies import MLP, POLICIES, BeT, DiffusionPolicy, Policy
 from ..tasks import get_task
 from ..tasks.spec import TaskSpec
@@ -59,7 +59,6 @@ def imitate_pixels(kind: str, demos: Demos, pictures: Pictures, config: ImitateC
                       config.hold_end).to(device)
     rgb, depth = (torch.from_numpy(x).to(device) for x in (pictures.rgb, pictures.depth.astype(np.int32)))
     optimizer = make_optimizer(policy, config, [{"params": list(encoder.parameters()), "weight_decay": config.weight_decay}], device)
-    rates = torch.optim.lr_scheduler.LambdaLR(optimizer, config.lr_factor)
     average = Average([*policy.parameters(), *encoder.parameters()], config.ema_power)
 
     def batch() -> tuple[torch.Tensor, ...]:
@@ -74,24 +73,12 @@ def imitate_pixels(kind: str, demos: Demos, pictures: Pictures, config: ImitateC
         features = encoder(*seen.split([rgb.shape[1], depth.shape[1]], dim=1)).unflatten(0, state.shape[:2])
         return policy.loss(torch.cat([state, features.float()], dim=-1), actions, *drawn)
 
+    def candidate() -> tuple[tuple[Policy, Encoder], dict[str, float]]:
+        it = _finished(policy, encoder, demos, pictures)
+        return it, selection_scores(pixel_spec(spec, it[1]), it[0], config.eval_episodes, config.seed)
+
     step = GradientSteps(loss, optimizer, device, config.bf16)
-    history, best, chosen, started = [], -1.0, None, time.monotonic()
-    for iteration in range(1, config.iterations + 1):
-        terms = step(*batch())
-        rates.step()
-        average.step()
-        if iteration % config.eval_every and iteration < config.iterations:
-            continue
-        row = checkpoint_row(iteration, started, terms, config.lr)
-        with average.in_place():
-            candidate = _finished(policy, encoder, demos, pictures)
-        row |= selection_scores(pixel_spec(spec, candidate[1]), candidate[0], config)
-        score = row.get("success_once", float(iteration))  # without evaluations the latest wins
-        if score > best:
-            best, chosen = score, candidate
-        history.append(row)
-        if progress:
-            progress(row)
+    chosen, history = best_checkpoint(config, lambda: step(*batch()), optimizer, average, candidate, progress)
     return *chosen, history
 
 
