@@ -29,7 +29,7 @@ from .rl.sac import SAC
 from .runs import Run
 from .seeds import training_seed
 from .tasks import get_task
-from .tasks.batched import load_physx_cuda, require_batched
+from .tasks.batched import require_batched
 from .tasks.horizon import horizon_spec, shortened
 from .tasks.spec import TaskSpec
 from .tasks.vector import Episode, VectorEnv
@@ -48,7 +48,6 @@ class Trainer:
         self.spec = horizon_spec(spec or get_task(config.task), config.start_fraction)
         if config.simulator == "physx_cuda":
             require_batched(self.spec)
-            load_physx_cuda()
         if base.chunk != 1 and not self.chunks:
             raise PdkitError(f"{config.method} takes one action at a time, and this {base.kind} policy decides on {base.chunk} at once: "
                              "start from another one, or from the same with chunk=1.")
@@ -328,7 +327,7 @@ class Trainer:
         self.nstep.load(group("nstep"), self.stored_dim, self.act_dim)
         self.generator.set_state(torch.from_numpy(arrays["generator"]))
         torch.set_rng_state(torch.from_numpy(arrays["torch_rng"]))
-        if self.config.device == "cuda":
+        if "cuda_rng" in arrays:
             torch.cuda.set_rng_state(torch.from_numpy(arrays["cuda_rng"]))
         self.rng.bit_generator.state = values["rng"]
         self.episode_counts = arrays["episode_counts"].tolist()

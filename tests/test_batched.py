@@ -3,7 +3,6 @@
 ManiSkill simulates one lane on a CPU; what takes several of its lanes is in test_cuda.py.
 """
 import dataclasses
-import functools
 
 import numpy as np
 import pytest
@@ -17,11 +16,11 @@ from pdkit.policies import POLICIES
 from pdkit.profiles import flat
 from pdkit.runs import Run
 from pdkit.tasks import batched, get_task
-from pdkit.tasks.batched import ManiSkillBatch
+from pdkit.tasks.batched import ManiSkillBatch, Together
 from pdkit.tasks.horizon import horizon_spec
 from pdkit.tasks.lanes import IDLE
 from pdkit.tasks.peg import peg_start
-from pdkit.tasks.vector import VectorEnv
+from pdkit.tasks.vector import SIMULATORS, VectorEnv
 
 
 class SideBySide:
@@ -42,14 +41,24 @@ class SideBySide:
             sim.close()
 
 
-@pytest.fixture
-def side_by_side(monkeypatch):
-    monkeypatch.setattr(batched, "ManiSkillBatch", SideBySide)
+@pytest.fixture(autouse=True)
+def other_simulators(monkeypatch):
+    """What tests simulate with: separate simulators, and the one lane that ManiSkill simulates on a CPU."""
+    monkeypatch.setitem(SIMULATORS, "side by side", side_by_side)
+    monkeypatch.setitem(SIMULATORS, "stock", stock_lanes)
+
+
+def side_by_side(spec, count, rules):
+    return Together(SideBySide(spec, count), count, rules)
+
+
+def stock_lanes(spec, count, rules):
+    return Together(ManiSkillBatch(spec, count, "physx_cpu"), count, rules)
 
 
 def both(spec, num_envs, queue_of, **rules):
     """The same lanes apart and together."""
-    return [VectorEnv(spec, num_envs, queue_of(), simulator=simulator, **rules) for simulator in ("cpu", "physx_cuda")]
+    return [VectorEnv(spec, num_envs, queue_of(), simulator=simulator, **rules) for simulator in ("cpu", "side by side")]
 
 
 def endless():
@@ -78,7 +87,7 @@ def same(one, other):
 @pytest.mark.parametrize("rules", [{}, {"chunk": 3}, {"chunk": 3, "terminate_on_success": True}, {"success_tail": 2},
                                    {"chunk": 2, "window": 3, "success_tail": 1}])
 @pytest.mark.parametrize("seeds", [endless, scarce])
-def test_lanes_together_report_what_lanes_apart_report(side_by_side, rules, seeds):
+def test_lanes_together_report_what_lanes_apart_report(rules, seeds):
     rng, finished = np.random.default_rng(0), 0
     apart, together = both(COUNT, 3, seeds, **rules)
     with apart, together:
@@ -91,7 +100,7 @@ def test_lanes_together_report_what_lanes_apart_report(side_by_side, rules, seed
     assert finished >= 4
 
 
-def test_together_a_real_task_is_the_same_to_the_last_bit(side_by_side):
+def test_together_a_real_task_is_the_same_to_the_last_bit():
     rng = np.random.default_rng(0)
     apart, together = both(get_task("StackCube"), 2, endless, chunk=2, window=2, max_episode_steps=5)
     with apart, together:
@@ -114,12 +123,12 @@ class AccountSim(CountSim):
         return np.array([self.seed, self.sum], np.float32), solved
 
 
-def test_a_snapshot_brings_lanes_of_different_ages_back(side_by_side):
+def test_a_snapshot_brings_lanes_of_different_ages_back():
     spec = dataclasses.replace(COUNT, make=AccountSim, max_episode_steps=5)
     rng, ages = np.random.default_rng(1), set()
     for steps in range(1, 8):
-        first = VectorEnv(spec, 3, endless(), terminate_on_success=True, window=3, simulator="physx_cuda")
-        with first, VectorEnv(spec, 3, endless(), terminate_on_success=True, window=3, simulator="physx_cuda") as second:
+        first = VectorEnv(spec, 3, endless(), terminate_on_success=True, window=3, simulator="side by side")
+        with first, VectorEnv(spec, 3, endless(), terminate_on_success=True, window=3, simulator="side by side") as second:
             first.reset()
             for _ in range(steps):
                 first.step(rng.uniform(-1, 0.7, (3, 1, 1)))
@@ -131,6 +140,11 @@ def test_a_snapshot_brings_lanes_of_different_ages_back(side_by_side):
                 actions = rng.uniform(-1, 0.7, (3, 1, 1))
                 assert same(first.step(actions), second.step(actions))
     assert len(ages) > 2  # of which some began later than others
+
+
+def arm(stock):
+    """The kinematics of a batch's arm, by which actions become joint positions."""
+    return stock._env.agent.controller.controllers["arm"].kinematics
 
 
 @pytest.mark.parametrize("task, tolerance", [("StackCube", 1e-4), ("PegInsertionSide", 5e-3)])
@@ -150,6 +164,28 @@ def test_maniskills_batched_step_starts_and_moves_as_the_fast_step(task, toleran
         fast.close()
 
 
+@pytest.mark.parametrize("task", ["StackCube", "PegInsertionSide"])
+def test_the_arm_control_of_a_gpu_moves_as_the_fast_step_where_actions_are_small(task):
+    """ManiSkill's inverse kinematics for GPUs, which runs on a CPU too; where actions are large it falls short (see batched.py)."""
+    spec, apart = get_task(task), []
+    stock, fast = ManiSkillBatch(spec, 1, "physx_cpu"), spec.make()
+    try:
+        stock.reset(np.array([0]), np.array([7]))
+        arm(stock)._setup_gpu()
+        for size in (0.1, 1.0):
+            rng = np.random.default_rng(0)
+            stock.reset(np.array([0]), np.array([7]))
+            fast.reset(7)
+            for _ in range(5):
+                action = (size * rng.uniform(-1, 1, spec.act_dim)).astype(np.float32)
+                observation, expected = stock.step(action[None])[0][0], fast.step(action)[0]
+            apart.append(np.abs(observation - expected)[:9].max())  # of the joints' positions, radians
+    finally:
+        stock.close()
+        fast.close()
+    assert apart[0] < 5e-3 and apart[1] > 3 * apart[0]
+
+
 def test_a_lane_keeps_the_peg_that_it_was_built_with_where_another_episode_lies():
     spec = get_task("PegInsertionSide")
     stock, fast = ManiSkillBatch(spec, 1, "physx_cpu"), spec.make()
@@ -165,14 +201,28 @@ def test_a_lane_keeps_the_peg_that_it_was_built_with_where_another_episode_lies(
     np.testing.assert_allclose(observation[39:42], [built.half_length, built.radius, built.radius], atol=1e-6)
 
 
-def test_a_run_trains_on_the_batched_step_and_resumes(monkeypatch, tmp_path):
+def test_a_restored_lane_has_the_peg_that_it_was_built_with():
+    spec, seeds = dataclasses.replace(get_task("PegInsertionSide"), max_episode_steps=3), iter([7, 11, 12, 13])
+    with VectorEnv(spec, 1, lambda lane: next(seeds), simulator="stock") as first:
+        first.reset()
+        for _ in range(4):
+            first.step(np.zeros((1, 1, 7)))
+        snapshot, seen = first.snapshot(), first._windows[0, 0]
+    with VectorEnv(spec, 1, lambda lane: 99, simulator="stock") as second:
+        again = second.restore(snapshot)[0, 0]
+        assert second.snapshot()["built"].tolist() == [7]
+    built = peg_start(7)
+    assert snapshot["seeds"].tolist() == [11] and len(snapshot["actions"]) == 1
+    np.testing.assert_allclose(again[39:42], [built.half_length, built.radius, built.radius], atol=1e-6)
+    np.testing.assert_allclose(again, seen, atol=1e-3)
+
+
+def test_a_run_trains_on_the_batched_step_and_resumes(tmp_path):
     """The whole loop on the one lane that ManiSkill simulates on a CPU."""
-    monkeypatch.setattr(batched, "ManiSkillBatch", functools.partial(ManiSkillBatch, backend="physx_cpu"))
-    monkeypatch.setattr("pdkit.online.load_physx_cuda", lambda: None)
     spec = get_task("StackCube")
     torch.manual_seed(0)
     base = POLICIES["mlp"](dict(obs_dim=spec.obs_dim, act_dim=spec.act_dim, hidden=8))
-    config = OnlineConfig(task="StackCube", simulator="physx_cuda", num_envs=1, env_workers=1, eval_workers=0, total_steps=120,
+    config = OnlineConfig(task="StackCube", simulator="stock", num_envs=1, env_workers=1, eval_workers=0, total_steps=120,
                           warmup_steps=40, batch=16, utd=0.1, demo_fraction=0.0, eval_every=0, log_every=40, train_limit=30,
                           checkpoint_every=50)
 
@@ -188,25 +238,28 @@ def test_a_run_trains_on_the_batched_step_and_resumes(monkeypatch, tmp_path):
     assert all(row["train_length"] == 30 for row in trainer.rows)
 
 
-def test_what_cannot_be_simulated_together_is_refused_with_what_to_do():
-    stack, peg = get_task("StackCube"), get_task("PegInsertionSide")
-    for spec in (get_task("Door"), get_task("TurnFaucet"), horizon_spec(stack, 0.5)):
-        with pytest.raises(PdkitError, match="physx_cuda simulates StackCube and PegInsertionSide.*set simulator=cpu"):
-            VectorEnv(spec, 2, endless(), simulator="physx_cuda")
-    with pytest.raises(PdkitError, match="Unknown simulator 'physx'"):
-        OnlineConfig(simulator="physx")
-    if not torch.cuda.is_available():
-        with pytest.raises(PdkitError, match="needs a CUDA device.*set simulator=cpu"):
-            VectorEnv(peg, 2, endless(), simulator="physx_cuda")
+def test_what_cannot_be_simulated_together_is_refused_with_what_to_do(monkeypatch):
+    base = POLICIES["mlp"](dict(obs_dim=39, act_dim=28, hidden=8))
+    for spec in (get_task("Door"), get_task("TurnFaucet"), horizon_spec(get_task("StackCube"), 0.5)):
+        with pytest.raises(PdkitError, match="^physx_cuda simulates StackCube and PegInsertionSide.*set simulator=cpu"):
+            VectorEnv(spec, 2, endless(), simulator="physx_cuda")  # from the process that simulates
+    with pytest.raises(PdkitError, match="^physx_cuda simulates"):
+        Trainer(OnlineConfig(task="Door", simulator="physx_cuda"), base)  # before anything is made
+    for make in (OnlineConfig, lambda simulator: VectorEnv(COUNT, 1, endless(), simulator=simulator)):
+        with pytest.raises(PdkitError, match="Unknown simulator 'physx'"):
+            make(simulator="physx")
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(PdkitError, match="needs a CUDA device.*set simulator=cpu"):
+        batched.require_batched(get_task("PegInsertionSide"))
 
 
-def test_a_missing_physx_library_is_one_sentence(monkeypatch):
+@pytest.mark.parametrize("what, fix", [("no network", "sapien-sim/physx-precompiled"), ("libcuda.so: cannot open", "libcuda.so known")])
+def test_a_missing_library_is_one_sentence(monkeypatch, what, fix):
     from sapien import physx
 
     def fails():
-        raise OSError("no network")
+        raise OSError(what)
 
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(physx, "enable_gpu", fails)
-    with pytest.raises(PdkitError, match="no network.*sapien-sim/physx-precompiled.*set simulator=cpu"):
+    with pytest.raises(PdkitError, match=f"{what}.*{fix}.*set simulator=cpu"):
         batched.load_physx_cuda()

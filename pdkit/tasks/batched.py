@@ -2,14 +2,19 @@
 
 Here it is stock ManiSkill that steps, not the fast step of maniskill.py. What differs for a user:
 
+- The arm is controlled otherwise. On a CPU inverse kinematics is solved until the gripper's target is reached; on a GPU ManiSkill
+  takes one step along the Jacobian, which falls the shorter the further an action goes.
 - Physics on a GPU does not repeat bit for bit, so neither does a training run, and a restored checkpoint puts lanes only nearly
-  where they were. Evaluations therefore stay with the fast step on the CPU, which does repeat.
+  where they were.
+- Only training is simulated so. Every evaluation is made by the fast step on the CPU, in the world in which all policies of this
+  kit are compared; what a policy learned about the other controller does not help it there.
 - An episode starts where the fast step starts it for the same seed, but bodies cannot be built while the GPU simulates: a lane of
   PegInsertionSide keeps the peg and the box of its first episode, and only where they lie changes.
+- PhysX for CUDA changes how its process simulates on the CPU as well, so the lanes have a process of their own (see VectorEnv).
 """
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, Protocol
 from zipfile import BadZipFile
@@ -31,7 +36,7 @@ class BatchSim(Protocol):
     """N simulated worlds that take every step together; without time limit, reward or autoreset, as `Sim`."""
 
     def reset(self, lanes: np.ndarray, seeds: np.ndarray) -> np.ndarray:
-        """Start the episodes that `seeds` (k,) name in `lanes` (k,); observations (k, obs_dim)."""
+        """Start the episodes that `seeds` (k,) name in `lanes` (k,), which ascend; observations (k, obs_dim)."""
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """One primitive step of all lanes with actions (N, act_dim); (observations (N, obs_dim), success at this step (N,))."""
@@ -63,13 +68,9 @@ class ManiSkillBatch:
         num_envs: N.
         backend: ManiSkill's name of what simulates. "physx_cpu" takes one lane: so the tests compare it with the fast step.
 
-    Raises PdkitError for another task, and where there is no CUDA device or no PhysX library for it.
     """
 
     def __init__(self, spec: TaskSpec, num_envs: int, backend: str = "physx_cuda"):
-        require_batched(spec)
-        if backend == "physx_cuda":
-            load_physx_cuda()
         self._start = STARTS[spec.make]
         self._env = make_env(spec.make.env_id, spec.make.control, sim_backend=backend, num_envs=num_envs, reconfiguration_freq=0)
         self._built: list[int] = []  # the seed that each lane was built for
@@ -107,53 +108,52 @@ class ManiSkillBatch:
 
 
 def require_batched(spec: TaskSpec) -> None:
-    """Raises PdkitError for a task that ManiSkill cannot simulate in a batch: not a stock one, or one that was changed."""
+    """Raises PdkitError without a GPU, and for a task that is not a stock one of ManiSkill, or that was changed."""
+    import torch
+
     if spec.make not in STARTS:
         raise PdkitError(f"physx_cuda simulates {' and '.join(task.__name__ for task in STARTS)}, whole episodes with states as "
                          f"observations, and not {spec.name} as it is set up here; set simulator=cpu.")
+    if not torch.cuda.is_available():
+        raise PdkitError("physx_cuda needs a CUDA device, and none was found; set simulator=cpu, or check the driver with `pdkit doctor`.")
 
 
 def load_physx_cuda() -> None:
     """Load SAPIEN's PhysX library for CUDA, which SAPIEN fetches when it is first needed. Raises PdkitError where that fails."""
-    import torch
-
-    if not torch.cuda.is_available():
-        raise PdkitError("physx_cuda needs a CUDA device, and none was found; set simulator=cpu, or check the driver with `pdkit doctor`.")
     with quiet():
         from sapien import physx
+
     try:
         physx.enable_gpu()
     except (OSError, BadZipFile, RuntimeError) as error:  # no network is an OSError too
-        folder = Path.home() / ".sapien" / "physx" / physx.version()
-        raise PdkitError(f"SAPIEN's PhysX library for CUDA could not be loaded ({error}): unzip the one for this system from GitHub, "
-                         f"sapien-sim/physx-precompiled, release {physx.version()}, into {folder}, or set simulator=cpu.") from None
+        release = physx.version()
+        fix = "make the driver's libcuda.so known to the loader" if "libcuda" in str(error) else (
+            f"unzip the one for this system from GitHub, sapien-sim/physx-precompiled, release {release}, into "
+            f"{Path.home() / '.sapien' / 'physx' / release}")
+        raise PdkitError(f"SAPIEN's PhysX library for CUDA could not be loaded ({error}): {fix}, or set simulator=cpu.") from None
+
+
+def gpu_lanes(spec: TaskSpec, count: int, rules: tuple) -> Together:
+    """Lanes on the GPU, in a process that has simulated nothing yet. Raises PdkitError where they cannot be had."""
+    require_batched(spec)
+    load_physx_cuda()
+    return Together(ManiSkillBatch(spec, count), count, rules)
 
 
 class Together:
-    """Lanes of one `BatchSim`, behind the same methods as InProcess and Workers (lanes.py).
+    """The lanes of one `BatchSim`; used as Lanes (lanes.py) are.
 
     Every primitive step is all lanes' at once: a lane without an episode, or one whose episode ended before its chunk did, is
     stepped along and not looked at.
     """
 
-    def __init__(self, shapes, sim: BatchSim, rules: tuple):
-        self.arrays = {name: np.zeros(shape, dtype) for name, (shape, dtype) in shapes.items()}
-        self._sim, self._episodes, self._pending = sim, [EpisodeCount(*rules) for _ in self.arrays["steps"]], ""
+    def __init__(self, sim: BatchSim, count: int, rules: tuple):
+        self._sim, self._episodes = sim, [EpisodeCount(*rules) for _ in range(count)]
 
-    def send(self, command: str) -> None:
-        self._pending = command
+    def reset(self, arrays: dict[str, np.ndarray]) -> None:
+        self._begin(np.arange(len(self._episodes)), arrays)
 
-    def receive(self) -> None:
-        getattr(self, self._pending)()
-
-    def call(self, command: str) -> None:
-        getattr(self, command)()
-
-    def reset(self) -> None:
-        self._begin(np.arange(len(self._episodes)))
-
-    def step(self) -> None:
-        arrays = self.arrays
+    def step(self, arrays: dict[str, np.ndarray]) -> None:
         going = np.array([episode.seed != IDLE for episode in self._episodes])
         arrays["steps"][:] = 0
         for k in range(arrays["actions"].shape[1]):
@@ -167,35 +167,33 @@ class Together:
                 if arrays["ended"][i].any():
                     arrays["episode"][i] = (episode.seed, episode.length, episode.once, solved[i])
                     going[i] = False
-        self._begin(np.flatnonzero(arrays["ended"].any(axis=1) & (arrays["steps"] > 0)))
+        self._begin(np.flatnonzero(arrays["ended"].any(axis=1) & (arrays["steps"] > 0)), arrays)
 
-    def _begin(self, lanes: np.ndarray) -> None:
-        """Start the episodes that the seeds name in these lanes, or leave them idle."""
-        for lane in lanes:
-            self._episodes[lane].begin(self.arrays["seeds"][lane])
-        lanes = lanes[self.arrays["seeds"][lanes] != IDLE]
-        if len(lanes):
-            self.arrays["first"][lanes] = self._sim.reset(lanes, self.arrays["seeds"][lanes])
+    def _begin(self, lanes: np.ndarray, arrays: dict[str, np.ndarray]) -> None:
+        for lane, first in self._started(lanes, arrays["seeds"][lanes]):
+            arrays["first"][lane] = first
+
+    def _started(self, lanes: np.ndarray, seeds: np.ndarray) -> Iterable[tuple[int, np.ndarray]]:
+        """Start the episodes that `seeds` (k,) name in `lanes` (k,), or leave a lane idle; those that began, with what they see first."""
+        for lane, seed in zip(lanes, seeds, strict=True):
+            self._episodes[lane].begin(seed)
+        live = seeds != IDLE
+        return zip(lanes[live], self._sim.reset(lanes[live], seeds[live]), strict=True) if live.any() else ()
 
     def replay(self, histories: list[tuple[int, np.ndarray]]) -> list[np.ndarray]:
-        """As `_Lanes.replay`. All lanes arrive at the same step, so one with a shorter history starts later."""
+        """As `Lanes.replay`. All lanes arrive at the same step, so one with a shorter history starts later."""
         seeds = np.array([seed for seed, _ in histories], np.int64)
         lengths = np.array([len(actions) for _, actions in histories])
-        longest = lengths.max()
-        self.arrays["seeds"][:] = seeds
-        self.reset()
-        out: list[list[np.ndarray]] = [[] for _ in histories]
+        longest, out = lengths.max(), [[] for _ in histories]
         for step in range(longest + 1):
-            first = np.flatnonzero((lengths == longest - step) & (seeds != IDLE))
-            if step:
-                self._begin(first)
-            for i in first:
-                out[i].append(self.arrays["first"][i].copy())
+            begin = np.flatnonzero(lengths == longest - step)
+            for i, first in self._started(begin, seeds[begin]):
+                out[i].append(first)
             if step == longest:
                 break
             at = step - (longest - lengths)  # where each lane stands in its history; below 0: not yet begun
             going = np.flatnonzero((at >= 0) & (seeds != IDLE))
-            actions = np.zeros_like(self.arrays["actions"][:, 0])
+            actions = np.zeros((len(histories), histories[0][1].shape[1]), np.float32)
             actions[going] = [histories[i][1][at[i]] for i in going]
             observations, solved = self._sim.step(actions)
             for i in going:

@@ -89,10 +89,10 @@ class _Lane:
         return np.stack(observations), np.array(successes), terminated, truncated
 
 
-class _Lanes:
-    """A group of lanes stepped one after the other, writing into shared arrays."""
+class Lanes:
+    """A group of lanes stepped one after the other, writing into shared arrays. `rules` are those of `EpisodeCount`."""
 
-    def __init__(self, spec: TaskSpec, count: int, *rules):
+    def __init__(self, spec: TaskSpec, count: int, rules: tuple):
         self._spec = spec
         self.lanes = [_Lane(_simulation(spec), *rules) for _ in range(count)]
 
@@ -142,12 +142,11 @@ class _Lanes:
 
 
 class InProcess:
-    """All lanes in this process; the work is done when the result is asked for."""
+    """All lanes in this process; the work is done when the result is asked for. `make(count)` makes lanes."""
 
-    def __init__(self, shapes, num_envs: int, arguments):
+    def __init__(self, shapes, num_envs: int, make: Callable[[int], Lanes]):
         self.arrays = {name: np.zeros(shape, dtype) for name, (shape, dtype) in shapes.items()}
-        spec, *rules = arguments
-        self._lanes = _Lanes(spec, num_envs, *rules)
+        self._lanes = make(num_envs)
         self._pending = ""
 
     def send(self, command: str) -> None:
@@ -168,9 +167,9 @@ class InProcess:
 
 
 class Workers:
-    """Lanes spread over spawned processes; arrays in shared memory, one byte string a command."""
+    """Lanes spread over spawned processes; arrays in shared memory, one byte string a command. `make(count)` makes lanes there."""
 
-    def __init__(self, shapes, num_envs: int, workers: int, arguments):
+    def __init__(self, shapes, num_envs: int, workers: int, make: Callable[[int], Lanes]):
         context = multiprocessing.get_context("spawn")  # fork is unsafe once torch has threads
         self._memory, self.arrays = _share(shapes)
         bounds = np.linspace(0, num_envs, workers + 1).astype(int)
@@ -179,7 +178,7 @@ class Workers:
         names = {name: block.name for name, block in self._memory.items()}
         for part in self._slices:
             ours, theirs = context.Pipe()
-            process = context.Process(target=_worker, args=(theirs, names, shapes, part, arguments), daemon=True)
+            process = context.Process(target=_worker, args=(theirs, names, shapes, part, make), daemon=True)
             process.start()
             theirs.close()
             self._pipes.append(ours)
@@ -252,15 +251,14 @@ def _share(shapes) -> tuple[dict[str, shared_memory.SharedMemory], dict[str, np.
     return blocks, arrays
 
 
-def _worker(pipe, names, shapes, part: slice, arguments) -> None:
+def _worker(pipe, names, shapes, part: slice, make: Callable[[int], Lanes]) -> None:
     """The process of one worker: build the lanes, then obey commands until told to close or the parent is gone."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
     blocks = {name: shared_memory.SharedMemory(name=block) for name, block in names.items()}
     arrays = {name: np.ndarray(*shapes[name], buffer=block.buf)[part] for name, block in blocks.items()}
     lanes = None
     try:
-        spec, *rules = arguments
-        lanes = _Lanes(spec, part.stop - part.start, *rules)
+        lanes = make(part.stop - part.start)
         pipe.send("ready")
         while True:
             command, payload = pipe.recv()
@@ -269,6 +267,8 @@ def _worker(pipe, names, shapes, part: slice, arguments) -> None:
             pipe.send(lanes.replay(payload) if command == "replay" else getattr(lanes, command)(arrays))
     except (EOFError, KeyboardInterrupt, BrokenPipeError):
         pass
+    except PdkitError as error:
+        pipe.send(error)
     except Exception as error:
         pipe.send(PdkitError(f"A simulator process failed: {type(error).__name__}: {error}"))
     finally:

@@ -9,14 +9,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
 
 import numpy as np
 
 from ..errors import PdkitError, unknown
-from .lanes import IDLE, InProcess, Workers
+from .batched import gpu_lanes
+from .lanes import IDLE, InProcess, Lanes, Workers
 from .spec import TaskSpec
 
-SIMULATORS = ("cpu", "physx_cuda")
+SIMULATORS: dict[str, Callable[..., Any]] = {"cpu": Lanes, "physx_cuda": gpu_lanes}
 
 
 @dataclass(frozen=True)
@@ -66,7 +69,7 @@ class VectorEnv:
         terminate_on_success: end an episode when solved (training); otherwise it runs to the time limit.
         success_tail: without termination, end an episode (as a time limit) this many steps after its first success; 0: never.
         max_episode_steps: another limit than the task's.
-        simulator: "cpu", or "physx_cuda": all lanes in one scene on a GPU, without workers (see batched.py for what differs).
+        simulator: "cpu", or "physx_cuda": all lanes in one scene on a GPU, always with one worker (see batched.py for what differs).
     """
 
     def __init__(self, spec: TaskSpec, num_envs: int, next_seed: Callable[[int], int], *, window: int = 1, chunk: int = 1,
@@ -86,15 +89,12 @@ class VectorEnv:
             "solved": ((num_envs, chunk), np.bool_), "steps": ((num_envs,), np.int64), "ended": ((num_envs, 2), np.bool_),
             "episode": ((num_envs, 4), np.int64),
         }
-        rules = (self.limit, terminate_on_success, success_tail)
-        if simulator == "physx_cuda":
-            from .batched import ManiSkillBatch, Together  # not above: it needs ManiSkill's tasks, and few ask for it
-
-            self._backend = Together(shapes, ManiSkillBatch(spec, num_envs), rules)
-        elif workers:
-            self._backend = Workers(shapes, num_envs, min(workers, num_envs), (spec, *rules))
-        else:
-            self._backend = InProcess(shapes, num_envs, (spec, *rules))
+        make = partial(SIMULATORS[simulator], spec, rules=(self.limit, terminate_on_success, success_tail))
+        if simulator == "physx_cuda":  # changes how its process simulates on the CPU, and must be there before anything else of PhysX
+            workers = 1
+        self._backend = Workers(shapes, num_envs, min(workers, num_envs), make) if workers else InProcess(shapes, num_envs, make)
+        self._built: np.ndarray | None = None  # the seeds of the lanes' first episodes, where lanes keep the bodies of those
+        self._keeps_bodies = simulator != "cpu"
         self._arrays = self._backend.arrays
         self._windows = np.zeros((num_envs, window, spec.obs_dim), np.float32)
         self._upcoming = np.full(num_envs, IDLE, np.int64)
@@ -104,6 +104,8 @@ class VectorEnv:
         for i in range(self.num_envs):
             self._arrays["seeds"][i] = self._next_seed(i)
         seeds = self._arrays["seeds"].copy()
+        if self._keeps_bodies and self._built is None:
+            self._built = seeds
         self._backend.call("reset")
         self._histories = [(int(seed), []) for seed in seeds]
         self._windows[:] = self._arrays["first"][:, None]
@@ -153,13 +155,17 @@ class VectorEnv:
         """
         lengths = np.array([len(actions) for _, actions in self._histories], np.int64)
         flat = [action for _, actions in self._histories for action in actions]
-        return {
+        built = {} if self._built is None else {"built": self._built}
+        return built | {
             "seeds": np.array([seed for seed, _ in self._histories], np.int64), "upcoming": self._upcoming.copy(), "lengths": lengths,
             "actions": np.stack(flat) if flat else np.zeros((0, self.spec.act_dim), np.float32),
         }
 
     def restore(self, snapshot: dict[str, np.ndarray]) -> np.ndarray:
         """Go back to a snapshot; windows (N, window, obs_dim)."""
+        if "built" in snapshot:
+            self._built = self._arrays["seeds"][:] = snapshot["built"]
+            self._backend.call("reset")
         parts = np.split(snapshot["actions"], np.cumsum(snapshot["lengths"])[:-1])
         self._histories = [(int(seed), list(part)) for seed, part in zip(snapshot["seeds"], parts, strict=True)]
         observations = self._backend.replay([(int(s), p) for s, p in zip(snapshot["seeds"], parts, strict=True)])
