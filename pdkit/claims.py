@@ -14,7 +14,7 @@ Every verdict follows one of few rules, so that no one is tempted to choose the 
 """
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -65,13 +65,25 @@ def by_seed(table: pd.DataFrame, recipe: str, column: str) -> pd.Series:
     return values
 
 
+def average(values: pd.Series) -> float:
+    """Mean over tasks of the means of their runs, by (task, seed): a task counts once, however many seeds it has."""
+    return float(values.groupby(level="task").mean().mean())
+
+
 def mean_interval(values: pd.Series) -> Interval:
-    """Mean over runs, by (task, seed), and its 95 % interval by Student's t; the spread is that within tasks."""
-    groups = values.groupby(level="task")
-    free = len(values) - groups.ngroups
-    spread = np.sqrt((values - groups.transform("mean")).pow(2).sum() / free / len(values))
-    half = float(stats.t.ppf(0.975, free) * spread)
-    return Interval(float(values.mean()), float(values.mean() - half), float(values.mean() + half))
+    """`average`, and its 95 % interval by Student's t; the spread is that within tasks, taken to be the same in all."""
+    task, names = pd.factorize(values.index.get_level_values("task"))
+    runs, free = np.bincount(task), len(values) - len(names)
+    means = np.bincount(task, values) / runs
+    variance = ((values.to_numpy() - means[task]) ** 2).sum() / free
+    half = float(stats.t.ppf(0.975, free) * np.sqrt(variance * (1 / runs).sum()) / len(names))
+    return Interval(float(means.mean()), float(means.mean() - half), float(means.mean() + half))
+
+
+def task_by_task(values: pd.Series, show: Callable[[float], str]) -> str:
+    """What stands behind a mean over several tasks: each task's own, in brackets; nothing for one task."""
+    means = values.groupby(level="task").mean()
+    return f" ({', '.join(f'{task} {show(mean)}' for task, mean in means.items())})" if len(means) > 1 else ""
 
 
 def difference(first: pd.Series, second: pd.Series) -> tuple[Interval, pd.Series]:
@@ -114,7 +126,7 @@ def jointly(*verdicts: str) -> str:
 
 def told_apart(*sides: pd.Series) -> None:
     """Raises TooLittle when no side solves anything to speak of."""
-    if max(side.mean() for side in sides) < FLOOR:
+    if max(average(side) for side in sides) < FLOOR:
         raise TooLittle("All sides end near 0: this budget does not tell them apart.")
 
 
@@ -123,7 +135,7 @@ def best(table: pd.DataFrame, recipes: Sequence[str], column: str = "decorated_s
     means = {}
     for recipe in recipes:
         try:
-            means[recipe] = by_seed(table, recipe, column).mean()
+            means[recipe] = average(by_seed(table, recipe, column))
         except TooLittle:
             continue
     if not means:
@@ -162,6 +174,11 @@ def percent(value: float) -> str:
     return f"{100 * value:.1f} %"
 
 
+def signed(value: float) -> str:
+    """A difference of shares in points, without the word."""
+    return f"{100 * value:+.1f}"
+
+
 def points(interval: Interval) -> str:
     return f"{100 * interval.low:+.1f} to {100 * interval.high:+.1f} points ({METHOD})"
 
@@ -196,7 +213,8 @@ def set_against(record: str | Sequence[str], one: pd.Series, two: pd.Series, nam
     told_apart(one, two)
     one, two = matched(one, two)
     interval, values = difference(one, two)
-    told = f"{names[0]} {percent(one.mean())}, {names[1]} {percent(two.mean())}: {100 * interval.value:+.1f} points"
+    told = (f"{names[0]} {percent(average(one))}, {names[1]} {percent(average(two))}: {signed(interval.value)} points"
+            f"{task_by_task(values, signed)}")
     return finding(record, values, told, points(interval), judged(interval if sign > 0 else turned(interval), enough), paper)
 
 
@@ -208,9 +226,9 @@ def ahead(record: str | Sequence[str], table: pd.DataFrame, own: str, kinds: Map
     for kind, recipes in kinds.items():
         rival = best(table, recipes)
         interval, values = difference(mine, by_seed(table, rival, "decorated_success"))
-        leads.append((interval, values, f"{100 * interval.value:+.1f} points against {rival} (best of {kind})"))
+        leads.append((interval, values, f"{signed(interval.value)} points against {rival} (best of {kind})"))
     interval, values, _ = min(leads, key=lambda lead: lead[0].value)
-    told = f"{percent(mine.loc[values.index].mean())}: " + ", ".join(lead[2] for lead in leads) + beside
+    told = f"{percent(average(mine.loc[values.index]))}: " + ", ".join(lead[2] for lead in leads) + beside
     return finding(record, values, told, points(interval),
                    weakest(*(judged(lead[0]) for lead in leads)), paper)
 

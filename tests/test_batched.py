@@ -9,12 +9,16 @@ import pytest
 import torch
 from test_vector import COUNT, CountSim
 
+from pdkit.decorated import load_decorated
 from pdkit.errors import PdkitError
+from pdkit.evaluate import evaluate
+from pdkit.files import DATA
 from pdkit.online import Trainer
 from pdkit.online_config import OnlineConfig
 from pdkit.policies import POLICIES
 from pdkit.profiles import flat
 from pdkit.runs import Run
+from pdkit.seeds import selection_seeds
 from pdkit.tasks import batched, get_task
 from pdkit.tasks.batched import ManiSkillBatch, Together
 from pdkit.tasks.horizon import horizon_spec
@@ -184,6 +188,37 @@ def test_the_arm_control_of_a_gpu_moves_as_the_fast_step_where_actions_are_small
         stock.close()
         fast.close()
     assert apart[0] < 5e-3 and apart[1] > 3 * apart[0]
+
+
+class LikeAGPU:
+    """StackCube as ManiSkill steps it on a CPU, with the arm control of a GPU."""
+
+    def __init__(self):
+        self._stock = ManiSkillBatch(get_task("StackCube"), 1, "physx_cpu")
+        self._stock.reset(np.array([0]), np.array([0]))
+        arm(self._stock)._setup_gpu()
+
+    def reset(self, seed):
+        return self._stock.reset(np.array([0]), np.array([seed]))[0]
+
+    def step(self, action):
+        observations, solved = self._stock.step(action[None])
+        return observations[0], bool(solved[0])
+
+    def close(self):
+        self._stock.close()
+
+
+@pytest.mark.slow
+def test_a_policy_solves_as_much_with_the_arm_control_of_a_gpu():
+    """So policies trained in one world can be judged in the other: of 20 episodes of the shipped decorated policy, at most 3 differ."""
+    policy, spec = load_decorated(DATA / "checkpoints" / "StackCube" / "decorated"), get_task("StackCube")
+    rates = []
+    for world in (spec, dataclasses.replace(spec, make=LikeAGPU)):
+        policy.reset(0)
+        table = evaluate(world, policy.act, selection_seeds(20), window=policy.window, chunk=policy.chunk, num_envs=4)
+        rates.append(table.success_once.sum())
+    assert min(rates) >= 16 and abs(rates[0] - rates[1]) <= 3
 
 
 def test_a_lane_keeps_the_peg_that_it_was_built_with_where_another_episode_lies():

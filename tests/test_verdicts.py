@@ -52,6 +52,16 @@ def test_means_beside_a_difference_are_of_the_seeds_that_it_compares(results):
     assert one.tolist() == [1.0] and two.tolist() == [4.0]
 
 
+def test_a_task_counts_once_however_many_seeds_it_has():
+    """Five seeds of one task that gains 10 points, three of another that loses 20: on average a loss."""
+    index = pd.MultiIndex.from_tuples([("Door", seed) for seed in range(5)] + [("Pen", seed) for seed in range(3)], names=["task", "seed"])
+    values = pd.Series([0.09, 0.1, 0.11, 0.1, 0.1, -0.21, -0.2, -0.19], index)
+    interval, pooled = claims.mean_interval(values), np.sqrt((0.0002 + 0.0002) / 6)
+    assert interval.value == pytest.approx(claims.average(values)) == pytest.approx(-0.05)
+    assert (interval.high - interval.low) / 2 == pytest.approx(2.4469 * pooled * np.sqrt(1 / 5 + 1 / 3) / 2, rel=1e-3)
+    assert claims.task_by_task(values, claims.signed) == " (Door +10.0, Pen -20.0)" and not claims.task_by_task(values[:5], claims.signed)
+
+
 def test_differences_are_taken_seed_by_seed():
     """Seeds differ much, the pairs hardly: unpaired, this interval would reach over zero."""
     table = pd.concat([runs("a", [0.1, 0.5, 0.9, 0.3]), runs("b", [0.05, 0.46, 0.84, 0.26]).iloc[::-1]])
@@ -278,6 +288,39 @@ def test_lifting_on_some_of_the_tasks_is_partly_at_most(results, ends, verdict):
     assert both.verdict == verdict and both.measured.startswith("ManiSkill from 50.0 %")
 
 
+def test_a_decorated_mlp_is_no_decorated_bet(results):
+    mlps, bets = (runs("lesson", ends, task=task, policy=policy, command="x") for task, policy, ends in (
+        ("StackCube", "mlp", [0.99] * 3), ("Hammer", "bet", [0.7, 0.71, 0.69])))
+    write(results, "main_job", mlps, bets)
+    found, suites = (verdicts.find(f"Policy Decorator lifts BeT bases from {start} %") for start in ("41.5", "36.25"))
+    assert (found.tasks, found.verdict) == ("Hammer", "partly")
+    assert "not counted: StackCube (mlp, 3 seeds) 50.0 % to 99.0 %" in found.measured
+    assert (suites.tasks, suites.verdict) == ("Hammer", "partly") and suites.measured.startswith("Adroit from 50.0 %")
+    write(results, "main_job", mlps)
+    assert all(verdicts.find(f"Policy Decorator lifts BeT bases from {start} %") is None for start in ("41.5", "36.25"))
+
+
+@pytest.mark.parametrize("ends, verdict", [([0.9, 0.8, 0.85], "partly"), ([0.95, 0.4, 0.9], "partly"), ([0.3, 0.4, 0.35], "not")])
+def test_novel_objects_and_the_mlp_below_them(results, ends, verdict):
+    """TurnFaucet alone is one of two tasks; its runs also answer for an MLP where no sweep of base policies does, above 20 points."""
+    write(results, "main_job", runs("lesson", ends, task="TurnFaucet", policy="mlp", command="x"),
+          runs("lesson", [0.0], task="PushChair", policy="mlp", command="x"), runs("lesson", ends, task="Door", command="x"))
+    novel = verdicts.find("Policy Decorator improves base policies on objects that no demonstration shows")
+    assert (novel.tasks, novel.verdict) == ("TurnFaucet", verdict) and "PushChair (one seed) 50.0 % to 0.0 %" in novel.measured
+    mlp = verdicts.find("Policy Decorator significantly improves an MLP base policy.")
+    assert (mlp.tasks, mlp.verdict) == ("TurnFaucet", "reproduced" if min(ends) >= 0.8 else "not" if max(ends) < 0.5 else "partly")
+    write(results, "base_policies", runs("mlp", [0.6] * 3))
+    assert verdicts.find("Policy Decorator significantly improves an MLP base policy.").tasks == "Door"
+
+
+@pytest.mark.parametrize("solved, verdict", [(0.9, "partly"), (0.5, "not")])
+def test_pictures_are_judged_by_one_run_and_never_reproduced(results, solved, verdict):
+    rows = [runs(recipe, [end], base=0.4, episodes=40, command="x") for recipe, end in (("pixels", solved), ("state", 0.1))]
+    write(results, "pixels", *rows)
+    found = verdicts.find("Policy Decorator improves base policies that see pictures as well")
+    assert found.verdict == verdict and f"from 40.0 % to {100 * solved:.1f} %" in found.measured and "Wilson" in found.interval
+
+
 def test_all_tasks_with_nearly_all_success_are_lifted(results):
     tasks = [task for suite in claims.TASKS.values() for task in suite]
     start = "Policy Decorator lifts BeT bases from 41.5 % to 98.95 % success"
@@ -414,7 +457,14 @@ def test_a_long_horizon_is_a_factor_where_fine_tuning_fails_on_the_whole_task_al
     write(results, "horizon", *parts, runs("policy_decorator,start_fraction=0.0", [0.9] * 3))
     found = verdicts.find("A long task horizon is a key factor in the failure of fine-tuning baselines.")
     assert (found.verdict, found.tasks, found.seeds) == (verdict, "Door", "0 1 2")
-    assert f"start at 0: gain {100 * (whole - 0.5):+.1f} points" in found.measured and found.command.endswith("sweeps/horizon.toml")
+    assert f"SAC fine-tuning 0: {100 * (whole - 0.5):+.1f}, 0.5: -10.0, " in found.measured and "the decorator: 0: +40.0" in found.measured
+    assert found.command.endswith("sweeps/horizon.toml")
+
+
+def test_where_the_middle_start_loses_most_the_horizon_explains_a_part(results):
+    parts = [runs(f"sac_finetune,start_fraction={f}", [end - 0.01, end, end + 0.01]) for f, end in ((0.0, 0.2), (0.5, 0.1), (0.75, 0.6))]
+    write(results, "horizon", *parts)
+    assert verdicts.find("A long task horizon is a key factor in the failure of fine-tuning baselines.").verdict == "partly"
 
 
 @pytest.mark.parametrize(("rates", "verdict"), [([0.0, 0.5], "reproduced"), ([0.2, 0.2], "not"), ([0.4, 0.1], "not")])

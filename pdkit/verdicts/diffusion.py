@@ -17,6 +17,7 @@ from ..claims import (
     Finding,
     TooLittle,
     ahead,
+    average,
     best,
     by_seed,
     difference,
@@ -59,7 +60,7 @@ def _() -> Finding:
     records, table = _recorded()
     end, start = (by_seed(table, DECORATOR, column) for column in ("decorated_success", "base_success"))
     gain, values = difference(end, start)
-    return finding(records, values, f"{percent(start.mean())} to {percent(end.mean())}: {100 * gain.value:+.1f} points", points(gain),
+    return finding(records, values, f"{percent(average(start))} to {percent(average(end))}: {100 * gain.value:+.1f} points", points(gain),
                    jointly(judged(gain), judged(mean_interval(end), NEARLY)), EIGHT)
 
 

@@ -12,6 +12,7 @@ from ..claims import (
     METHOD,
     Finding,
     TooLittle,
+    average,
     by_seed,
     compared,
     difference,
@@ -26,6 +27,7 @@ from ..claims import (
     points,
     recorded,
     set_against,
+    signed,
     times,
     told_apart,
     turned,
@@ -49,8 +51,8 @@ def _() -> Finding:
     told_apart(*ends, *ways)
     ends, ways = matched(*ends), matched(*ways)
     (end, values), (way, _) = difference(*ends), difference(*ways)
-    return finding("leaderboard", values, f"Cal-QL and SAC fine-tuning: at the end {percent(ends[0].mean())}, {percent(ends[1].mean())}; "
-                   f"over all evaluations {percent(ways[0].mean())}, {percent(ways[1].mean())}",
+    at_end, on_the_way = (", ".join(percent(average(side)) for side in sides) for sides in (ends, ways))
+    return finding("leaderboard", values, f"Cal-QL and SAC fine-tuning: at the end {at_end}; over all evaluations {on_the_way}",
                    f"at the end {points(end)}; over all evaluations {points(way)}",
                    jointly(judged(turned(end), -0.1), judged(turned(way), -0.1)))
 
@@ -259,10 +261,11 @@ def _() -> Finding:
     rows = by_fraction(recorded("horizon")[0])
     whole, short = end_gains(rows)
     interval, values = difference(short, whole)
-    told = "; ".join(f"start at {f:g}: gain {100 * part.gain.mean():+.1f} points"
-                     for f, part in rows[rows.method == "sac_finetune"].groupby("start_fraction"))
-    return finding("horizon", values, f"SAC fine-tuning over its base, by the share of the way that lies behind: {told}",
-                   f"latest less whole: {points(interval)}", failure_verdict(rows)[0])
+    told = {method: ", ".join(f"{f:g}: {signed(part.gain.mean())}" for f, part in mine.groupby("start_fraction"))
+            for method, mine in rows.groupby("method")}
+    beside = f"; the decorator: {told['policy_decorator']}" if "policy_decorator" in told else ""
+    return finding("horizon", values, "points gained over the base policy, by the share of the way that lies behind: SAC fine-tuning "
+                   f"{told['sac_finetune']}{beside}", f"latest less whole: {points(interval)}", failure_verdict(rows)[0])
 
 
 def _numbered(prefix: str) -> tuple[pd.DataFrame, dict[float, str]]:
