@@ -18,7 +18,7 @@ from .files import ROOT, atomic_file, atomic_folder, read_json, sha256, write_js
 
 PACKAGES = ("torch", "numpy", "gymnasium", "gymnasium-robotics", "mujoco", "mani-skill", "sapien")
 
-NO_MATTER = {"env_workers", "eval_workers"}  # parameters on which results do not depend: a run may go on with others
+NO_MATTER = {"env_workers", "eval_workers", "checkpoint_every"}  # results do not depend on these: a run may go on with others
 
 
 def _git() -> str:

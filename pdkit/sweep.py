@@ -243,15 +243,29 @@ def record_results(name: str, jobs: Sequence[Job], command: str) -> int:
 
 
 def missing(jobs: Sequence[Job], name: str) -> list[Job]:
-    """The jobs without a row in data/results/NAME.csv that was made by the very same command."""
+    """The jobs without a row in data/results/NAME.csv whose command trains, or runs, the same."""
     from .recorded import load
 
     try:
         rows = load(name)[0]
     except PdkitError:  # nothing is recorded yet
         return list(jobs)
-    done = set(zip(rows.task, rows.recipe, rows.seed, rows.command, strict=True))
-    return [job for job in jobs if (*(job.labels[key] for key in ("task", "recipe", "seed")), job.command) not in done]
+    done = set(zip(rows.task, rows.recipe, rows.seed, map(essence, rows.command), strict=True))
+    return [job for job in jobs if (*(job.labels[key] for key in ("task", "recipe", "seed")), essence(job.command)) not in done]
+
+
+def essence(command: str) -> tuple[str, ...]:
+    """The parts of a command on which its row depends, in an order of their own: all of another one's than `pdkit train decorated`."""
+    head, *options = command.split(" --")
+    if not head.startswith("pdkit train decorated"):
+        return (command,)
+    parts = {head}
+    for name, _, value in (option.partition(" ") for option in options):
+        if name == "set":
+            parts |= {f"set {word}" for word in shlex.split(value) if word.partition("=")[0] not in NO_MATTER}
+        elif name not in ("record", "threads") and (name, value) != ("method", DEFAULTS["method"]):
+            parts.add(f"{name} {value}")
+    return tuple(sorted(parts))
 
 
 @contextlib.contextmanager

@@ -388,6 +388,23 @@ def test_missing_leaves_out_what_is_recorded_by_the_same_command_alone(tmp_path,
     assert started == [second] and len(pd.read_csv(results / "tiny.csv")) == 2
 
 
+@pytest.mark.parametrize("other, same", [
+    ("pdkit train decorated Door --seeds 1 --method policy_decorator --threads 1 --set env_workers=0 utd=1 alpha=0.1 --record x", True),
+    ("pdkit train decorated Door --seeds 1 --set utd=1 alpha=0.2", False),
+    ("pdkit train decorated Door --seeds 2 --set alpha=0.1 utd=1", False),
+    ("pdkit train decorated Pen --seeds 1 --set alpha=0.1 utd=1", False), ("pdkit train decorated Door --seeds 1 --set alpha=0.1", False),
+    ("pdkit train decorated Door --seeds 1 --pixels --set alpha=0.1 utd=1", False)])
+def test_commands_are_the_same_where_what_differs_makes_no_difference(other, same):
+    assert (sweep.essence(other) == sweep.essence("pdkit train decorated Door --seeds 1 --set alpha=0.1 utd=1")) == same
+
+
+def test_the_main_jobs_recorded_rows_are_those_of_its_sweep():
+    """They were made one by one, by other words."""
+    spec = sweep.load_spec(DATA / "sweeps" / "main_job.toml")
+    todo = sweep.missing([job for job in sweep.make_jobs(spec) if job.labels["seed"] == 0], "main_job")
+    assert not todo
+
+
 def test_the_same_sweep_does_not_run_twice_at_once(tmp_path, results, capsys):
     with sweep._alone("tiny"):
         assert cli.main(["sweep", str(written(tmp_path))]) == 2

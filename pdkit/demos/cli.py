@@ -15,18 +15,21 @@ from . import sources
 from .experts import EXPERTS
 from .format import Demos, load_demos, save_demos
 
-SOURCES = ("scripted", "agent", "human")
+SOURCES = ("scripted", "agent", "human", "hub")
 
 
 def main(argv: list[str]) -> int:
     parser = Parser(prog="pdkit demos", description="Make demonstrations of a task, or describe a file of them.")
     parser.add_argument("task", nargs="?", help=f"one of: {', '.join(TASKS)}")
-    parser.add_argument("--num", type=int, default=100, help="episodes to make (default 100)")
-    parser.add_argument("--source", choices=SOURCES, help="who acts (default: a scripted expert where there is one, else an agent)")
+    parser.add_argument("--num", type=int, default=100, help="episodes to make, or at most to take from the hub (default 100)")
+    parser.add_argument("--source", choices=SOURCES, help="who acts (default: a scripted expert where there is one, else an agent); "
+                                                             "human and hub (ManiSkill's motion planning) are fetched from the network")
     parser.add_argument("--first-seed", type=int, help="seed of the first episode (scripted: 0, agent: 3000000)")
     parser.add_argument("--noise", type=float, default=0.0, help="standard deviation of Gaussian noise on the actions")
     parser.add_argument("--tail", type=int, default=40, help="agent: steps kept after the first success")
     parser.add_argument("--policy", help="agent: folder of a decorated policy (default: the shipped one)")
+    parser.add_argument("--from", dest="file", metavar="FILE", help="hub: what was downloaded already, its .zip, or a trajectory.h5 with "
+                                                                    "its trajectory.json beside it")
     parser.add_argument("--out", help="file to write (default runs/demos/TASK-SOURCE-NUM.safetensors)")
     parser.add_argument("--show", metavar="FILE", help="check and describe a file instead")
     parser.add_argument("--list", action="store_true", help="describe the bundled files")
@@ -45,6 +48,8 @@ def main(argv: list[str]) -> int:
         raise PdkitError(f"--num must be at least 1, not {args.num}.")
     get_task(args.task)
     source = args.source or ("scripted" if args.task in EXPERTS else "agent")
+    if args.file and source != "hub":
+        raise PdkitError("--from names a file of ManiSkill's hub; add --source hub.")
     out = Path(args.out) if args.out else runs_root() / "demos" / f"{args.task}-{source}-{args.num}.safetensors"
     try:
         out.parent.mkdir(parents=True, exist_ok=True)  # before the work, not after
@@ -73,6 +78,13 @@ def _draw(args) -> int:
 def _make(args, source: str) -> Demos:
     if source == "human":
         return sources.human(args.task)
+    if source == "hub":
+        from .hub import from_hub
+
+        demos = from_hub(args.task, args.num, args.file, Progress(args.num))
+        if demos.num < args.num:
+            print(f"\n{demos.num} demonstrations instead of {args.num}: there are no more that are solved here", file=sys.stderr)
+        return demos
     if source == "scripted":
         return sources.scripted(args.task, args.num, args.first_seed or 0, args.noise, Progress(args.num))
     from ..decorated import load_decorated
