@@ -5,6 +5,7 @@ reported beside the medians. Absolute numbers tell about this machine at this ho
 """
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -14,6 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from .claims import TASKS
 from .cli import Parser
 from .decorator import DecoratorConfig, critic_features
 from .demos import Demos
@@ -21,6 +23,7 @@ from .demos.sources import bundled
 from .files import DATA, write_json
 from .gradient_steps import GradientSteps, gradient_step, make_optimizer
 from .imitate import ImitateConfig, Windows
+from .pixels.sim import PixelSim
 from .policies import POLICIES
 from .profiles import online_config
 from .rl.replay import Replay
@@ -28,12 +31,14 @@ from .rl.sac import SAC, SACConfig
 from .runs import describe_machine
 from .tasks import get_task
 from .tasks.faucet import StockTurnFaucetSource
+from .tasks.maniskill_headless import render_device
 from .tasks.peg import StockPegInsertionSide
 from .tasks.stack_cube import StockStackCube
 from .tasks.vector import VectorEnv
 from .torch_setup import has_bf16, pick_device, set_threads
+from .video import try_render
 
-PARTS = ("step", "updates", "base", "imitation", "profiles")
+PARTS = ("step", "updates", "base", "imitation", "pictures", "profiles")
 
 
 def rate(work: Callable[[], int], seconds: float) -> float:
@@ -102,6 +107,26 @@ def bench_step(seconds: float) -> dict[str, Any]:
         out["fast step, two workers / stock, one process (steps/s)"] = paired(work, sim_stepper(stock, 4), seconds)
     fast.close()
     stock.close()
+    return out
+
+
+def bench_pictures(seconds: float) -> dict[str, Any]:
+    """Each task with a frame of all its cameras at every step, by the backend that draws it here, against the simulation alone.
+
+    Tasks that cannot be drawn here are said so and left out.
+    """
+    out = {}
+    for task in (name for suite in TASKS.values() for name in suite):
+        spec = get_task(task)
+        if reason := try_render(replace(spec, plan_view=False)):
+            print(f"{task} is not measured. {reason}", flush=True)
+            continue
+        backend = os.environ.get("MUJOCO_GL", "its default") if spec.suite == "adroit" else f"Vulkan, {render_device()}"
+        seen, alone = PixelSim(spec), spec.make()
+        out[f"{task}: simulated and drawn ({backend}) / simulated, one process (steps/s)"] = paired(
+            sim_stepper(seen, spec.act_dim), sim_stepper(alone, spec.act_dim), seconds)
+        seen.close()
+        alone.close()
     return out
 
 
@@ -258,7 +283,7 @@ def main(argv: list[str]) -> int:
           f"{has_bf16(device)}, updates on {device}.", flush=True)
     results: dict[str, Any] = {}
     ratios = {"step": lambda: bench_step(seconds), "updates": lambda: bench_updates(seconds, device), "base": lambda: bench_base(seconds),
-              "imitation": lambda: bench_imitation(seconds, device)}
+              "imitation": lambda: bench_imitation(seconds, device), "pictures": lambda: bench_pictures(seconds)}
     for part in (part for name, part in ratios.items() if name in args.only):
         for name, values in part().items():
             results[name] = values

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import torch
 
+from pdkit import bench
 from pdkit.bench import EagerSAC, imitator, main, paired, updater
 from pdkit.decorator import DecoratorConfig
 from pdkit.demos.sources import bundled
@@ -69,3 +70,29 @@ def test_parts_of_the_benchmark_can_be_measured_alone(tmp_path, capsys):
     assert list(read_json(path)["results"]) == ["base policy, BeT / MLP, 8 environments (decisions/s)"]
     with pytest.raises(PdkitError, match="invalid choice: 'nothing'"):
         main(["--only", "nothing"])
+
+
+def test_pictures_are_timed_where_they_can_be_drawn_and_what_cannot_is_said(monkeypatch, capsys):
+    monkeypatch.setattr(bench, "TASKS", {"some": ("Door", "StackCube")})
+    monkeypatch.setattr(bench, "try_render", lambda spec: None if spec.name == "Door" else "There is no driver.")
+
+    class Seen:
+        """Draws nothing, at half the speed."""
+
+        def __init__(self, spec):
+            self._sims = spec.make(), spec.make()
+
+        def reset(self, seed):
+            return [sim.reset(seed) for sim in self._sims]
+
+        def step(self, action):
+            return [sim.step(action) for sim in self._sims]
+
+        def close(self):
+            for sim in self._sims:
+                sim.close()
+
+    monkeypatch.setattr(bench, "PixelSim", Seen)
+    (name, values), = bench.bench_pictures(0.05).items()
+    assert name.startswith("Door: simulated and drawn (") and 0.2 < values["ratio"] < 0.9
+    assert "StackCube is not measured. There is no driver." in capsys.readouterr().out
