@@ -150,6 +150,19 @@ def test_the_papers_budgets_count_chunks_and_ours_primitive_steps():
     assert policy_values("StackCube", "lesson", "diffusion", 4) == {"gamma": 0.922, "n_step": 2}  # 0.98 and 5 a step
 
 
+@pytest.mark.parametrize("chunk", [2, 4, 16])  # the lengths that the paper's policies decide on
+def test_the_decorator_trains_over_chunks_of_the_papers_lengths(chunk):
+    base = DiffusionPolicy(dict(obs_dim=4, act_dim=2, window=2, horizon=20 if chunk == 16 else 8, chunk=chunk, dims=[16, 32], groups=4,
+                                embed=16, sampler_steps=2))
+    trainer = reach_trainer("policy_decorator", base, total_steps=500, warmup_steps=200, utd=0.1, batch=16)
+    policy = trainer.train()
+    assert trainer.act_dim == 2 * chunk == trainer.replay.unpack(trainer.replay.rows[:1])["base"].shape[1]
+    assert 500 <= trainer.step < 500 + 4 * chunk and trainer.agent.updates > 0
+    assert trainer.replay.size >= trainer.step / chunk - 4 * trainer.config.n_step  # one a decision; the latest still wait for returns
+    table = evaluate(PROBES["reach"], policy.act, range(500, 505), window=2, chunk=chunk)
+    assert table.length.max() <= PROBES["reach"].max_episode_steps and policy.act(np.zeros((3, 2, 4), np.float32)).shape == (3, chunk, 2)
+
+
 def test_what_a_method_is_stays_with_it_whatever_the_policy():
     """Residual RL keeps its open bound and gate over a Diffusion Policy; methods of single actions keep their discount."""
     base = DiffusionPolicy(dict(obs_dim=4, act_dim=2, window=2, horizon=4, chunk=2, dims=[16, 32], groups=4, embed=16))
