@@ -17,21 +17,24 @@ import numpy as np
 import pandas as pd
 
 from .claims import DECORATOR
+from .decorated import Decorated
 from .demos import sources
 from .errors import PdkitError
 from .methods import METHODS
+from .methods.jsrl import JumpStart, load_jump_start
 from .methods.ppo import OnPolicy
 from .methods.registry import base_folder, get_method, method_config, trainer_of
 from .pixels.pictures import encoded, pictures_of
 from .pixels.task import encoder_of
 from .plots_compare import labelled, over_seeds
-from .policies import load_policy
+from .policies import Policy, load_policy
 from .policies.base import read_card
 from .profiles import flat
 from .recorded import load
 from .runs import Run, origin
 from .stats import Interval, iqm, probability_of_improvement
 from .train import decorate
+from .transfer import load_any
 
 SCRATCH = "from scratch"
 FAMILIES = {  # how the methods are told apart in a figure: by what learns
@@ -191,7 +194,8 @@ def budgets(table: pd.DataFrame, labels: Mapping[str, str]) -> pd.DataFrame:
 def own_run(method: str, task: str, profile: str, seed: int, folder: Path, episodes: int, recipe: str = "", base: Path | None = None,
             **changes: Any) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Train one method once, below `folder`, and return its row and its curve in the form of recorded ones, as `recipe` (the method).
-    It starts from the policy in `base`, or from the shipped one that the method starts from.
+    It starts from the policy in `base`, or from the shipped one that the method starts from. Two columns more than a recorded row has:
+    start and folder, where the policy lies that it started from, and the run (see `before_and_after`).
 
     A finished run with the same settings is read, an interrupted one goes on. Raises PdkitError for an unknown method or setting, and
     where the policy is missing that the method starts from.
@@ -209,8 +213,19 @@ def own_run(method: str, task: str, profile: str, seed: int, folder: Path, episo
         seen = encoded(demos, pictures_of(demos), encoder) if encoder and demos else demos
         decorate(config, policy, seen, run.folder, episodes, origin(card, demos, encoder), encoder=encoder)
         run = Run(run.folder, "decorated", settings)
-    labels = {"task": task, "recipe": recipe or method, "seed": seed}
+    labels = {"task": task, "recipe": recipe or method, "seed": seed, "start": str(start), "folder": str(run.folder)}
     return pd.DataFrame([run.manifest["results"] | labels]), pd.read_csv(run.folder / "metrics.csv").assign(**labels)
+
+
+def before_and_after(row: pd.DataFrame) -> tuple[Policy, Policy | Decorated | JumpStart, int]:
+    """Of a run by `own_run`: the policy that it was given, the one it ended with, and the seed of a test episode to look at: the first
+    whose outcome they do not share, or the first of all."""
+    folder = Path(row.folder.item())
+    inside = folder / "decorated"
+    after = load_jump_start(inside) if (inside / "jump_start.json").exists() else load_any(inside)[1]
+    tables = [pd.read_csv(folder / f"{name}_episodes.csv") for name in ("base", "decorated")]
+    differ = (tables[0].success_once != tables[1].success_once).to_numpy()
+    return load_policy(Path(row.start.item())), after, int(tables[0].seed[differ.argmax()])
 
 
 def expected_minutes(table: pd.DataFrame, recipe: str, steps: int) -> float | None:

@@ -13,10 +13,11 @@ from typing import Any
 from . import nb, page
 from .cli import Parser
 from .errors import PdkitError
-from .files import read_json, runs_root
+from .files import ROOT, read_json, runs_root
 from .online_config import OnlineConfig
 from .plots import Picture
-from .profiles import PROFILES, online_config
+from .policies import Policy
+from .profiles import PROFILES, online_config, policy_values
 from .runs import Run
 from .stats import Paired
 
@@ -137,14 +138,21 @@ def _values(args: Any) -> dict[str, Any]:
     return nb.checked_parameters(NOTEBOOK, typed)
 
 
-def configured(values: dict[str, Any]) -> OnlineConfig:
-    """The training's configuration for the notebook's parameters: -1 stands for the profile's value."""
+def found(path: str) -> Path:
+    """What a parameter names, as it stands or below the kit's folder: a notebook runs in notebooks/, where data/... is not found."""
+    return Path(path) if Path(path).exists() else ROOT / path
+
+
+def configured(values: dict[str, Any], policy: Policy | None = None) -> OnlineConfig:
+    """The training's configuration for the notebook's parameters: -1 stands for the profile's value, which is another one over a base
+    `policy` that decides on several actions at once."""
     named = {name: values[name] for name in ("alpha", "H", "total_steps") if values.get(name, -1) != -1}
     both = sorted(named.keys() & values.get("changes", {}).keys())
     if both:
         raise PdkitError(f"{both[0]} is given as a parameter and in changes; give it once.")
-    return online_config(values.get("task", "Door"), values.get("profile", "lesson"), values.get("seed", 0), **named,
-                         **values.get("changes", {}))
+    task, profile = values.get("task", "Door"), values.get("profile", "lesson")
+    over = policy_values(task, profile, policy.kind, policy.chunk) if policy is not None else {}
+    return online_config(task, profile, values.get("seed", 0), **over | named | values.get("changes", {}))
 
 
 def reported_episodes(values: dict[str, Any]) -> int:

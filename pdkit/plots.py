@@ -8,6 +8,7 @@ from __future__ import annotations
 import io
 from collections.abc import Callable, Sequence
 from functools import wraps
+from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
@@ -40,6 +41,13 @@ class Picture(Figure):
         stream = io.BytesIO()
         self.savefig(stream, format="png", dpi=dpi)
         return stream.getvalue()
+
+    def save_small(self, path: str | Path, dpi: int = 130) -> None:
+        """Write the figure as a PNG of 128 colours: lines and areas look the same in a third of the bytes."""
+        from PIL import Image
+
+        picture = Image.open(io.BytesIO(self.png(dpi))).convert("RGB")
+        picture.quantize(128, dither=Image.Dither.NONE).save(path, "PNG", optimize=True)
 
 
 def styled(function: Callable[..., Picture]) -> Callable[..., Picture]:

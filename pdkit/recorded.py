@@ -41,7 +41,7 @@ def record(name: str, rows: pd.DataFrame, curves: pd.DataFrame) -> None:
         if len(tables) < 2 or not {"base_success", "decorated_success"} <= set(tables[0]):
             return
         with atomic_file(folder / f"{name}.png") as temporary:
-            figure(*tables, "Door" if "Door" in set(tables[0].task) else str(rows.task.iloc[0])).savefig(temporary, dpi=130)
+            figure(*tables, "Door" if "Door" in set(tables[0].task) else str(rows.task.iloc[0])).save_small(temporary)
 
 
 def load(name: str, task: str | None = None) -> tuple[pd.DataFrame, pd.DataFrame]:

@@ -159,7 +159,7 @@ def main(argv: list[str]) -> int:
             claims.to_csv(temporary, index=False)
         if (folder / "main_job.csv").exists():
             with atomic_file(folder / "all_tasks.png") as temporary:
-                _range(_read(folder / "main_job.csv")).savefig(temporary, dpi=130)
+                _range(_read(folder / "main_job.csv")).save_small(temporary)
     claims, tables = load_claims(folder / "claims.csv"), recorded_tables(folder)
     problems = claim_problems(claims)
     for name, table in tables.items():

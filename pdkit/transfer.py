@@ -7,6 +7,7 @@ from typing import Any
 
 import pandas as pd
 
+from . import video
 from .cli import Parser
 from .decorated import Decorated, load_decorated
 from .errors import PdkitError
@@ -18,6 +19,7 @@ from .recorded import record
 from .seeds import reported_seeds
 from .stats import wilson
 from .tasks import get_task
+from .tasks.spec import TaskSpec
 from .torch_setup import set_threads
 
 
@@ -53,18 +55,44 @@ def transfer(policy: Policy | Decorated, tasks: Sequence[str], episodes: int, en
     return pd.DataFrame(rows)
 
 
+def film(policy: Policy | Decorated, spec: TaskSpec, path: str | Path, episodes: int) -> Path:
+    """Write a test episode as a video: of a decorated policy beside its base, the first of `episodes` that only the decorated one solves,
+    if there is one. Raises PdkitError where the task cannot be drawn, or no encoder works.
+    """
+    if reason := video.try_render(spec):
+        raise PdkitError(reason)
+    path, seeds, apart = Path(path), reported_seeds(episodes), max(2, round(spec.rate / 20))
+    if isinstance(policy, Decorated):
+        pairs = video.contrasts(spec, policy.base, policy, seeds, stride=apart, tries=episodes)
+        clips = pairs[0] if pairs else video.record_all(spec, {"base": policy.base, "decorated": policy}, seeds[0], stride=apart)
+    else:
+        clips = video.record_all(spec, {policy.kind: policy}, seeds[0], stride=apart)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    written = video.write_video(video.side_by_side(*clips), path, fps=spec.rate / apart)  # as fast as it happens
+    if not written:
+        raise PdkitError(f"{path} was not written; try a name that ends in .webp, which needs no encoder.")
+    return written
+
+
 def main(argv: list[str]) -> int:
     parser = Parser(prog="pdkit evaluate", description="Success of a saved policy on the test episodes of one task or several.")
     parser.add_argument("policy", help="folder of a base policy or of a decorated one")
     parser.add_argument("--tasks", nargs="+", required=True, help="for example TurnFaucetSource TurnFaucet")
     parser.add_argument("--episodes", type=int, default=100, help="test episodes of each task (default 100)")
     parser.add_argument("--record", help="name under data/results: a row a task is added to NAME.csv")
+    parser.add_argument("--film", metavar="FILE", help="write an episode as FILE (.mp4 or .webp) instead, of a decorated policy one that "
+                                                       "its base does not solve, side by side")
     parser.add_argument("--threads", type=int, default=1)
     args = parser.parse_args(argv)
     if args.episodes < 1:
         raise PdkitError(f"--episodes must be at least 1, not {args.episodes}.")
     set_threads(args.threads)
     kind, policy = load_any(args.policy)
+    if args.film:
+        if len(args.tasks) > 1 or encoder_of(args.policy):
+            raise PdkitError("--film shows one task and policies that are told the state: name one task, and a policy without an encoder.")
+        print(f"wrote {film(policy, get_task(args.tasks[0]), args.film, args.episodes)}")
+        return 0
     rows = transfer(policy, args.tasks, args.episodes, encoder_of(args.policy))
     for row in rows.itertuples():
         print(f"{row.task}: {wilson(round(row.success * row.episodes), row.episodes)}; at the last step {row.success_at_end:.1%}")

@@ -10,7 +10,7 @@ import functools
 import os
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -142,6 +142,16 @@ def record(spec: TaskSpec, actor: Actor, seed: int, *, window: int = 1, steps: i
     return Clip(spec.name, int(seed), np.array(success, bool), frames, taken, label)
 
 
+def record_all(spec: TaskSpec, policies: Mapping[str, Policy | Decorated], seed: int, *, steps: int | None = None,
+               stride: int = 3) -> list[Clip]:
+    """The same episode once for each policy, in their order, labelled with their names; random numbers they draw start anew."""
+    clips = []
+    for name, policy in policies.items():
+        policy.reset(0)
+        clips.append(record(spec, policy.act, seed, window=policy.window, steps=steps, stride=stride, label=name))
+    return clips
+
+
 def _aim(sim, task: str) -> None:
     """Give a MuJoCo environment that draws our camera, before its first picture."""
     renderer = getattr(getattr(sim, "_env", None), "mujoco_renderer", None)
@@ -156,12 +166,13 @@ def trace(spec: TaskSpec, policy: Decorated, seed: int, *, steps: int | None = N
 
     def watched(windows: np.ndarray) -> np.ndarray:
         base, residual = policy.parts(windows)
-        rows.append({"base": np.abs(base).mean(), "residual": np.abs(scaled(policy.config, residual)).mean()})
-        return compose(policy.config, base, residual)[:, None]
+        sizes = (np.abs(part).reshape(policy.chunk, -1).mean(1) for part in (base, scaled(policy.config, residual)))
+        rows.extend({"base": b, "residual": r} for b, r in zip(*sizes, strict=True))
+        return compose(policy.config, base, residual).reshape(1, policy.chunk, -1)
 
     policy.reset(0)
     clip = record(spec, watched, seed, window=policy.window, steps=steps, pictures=False)
-    return pd.DataFrame(rows).assign(step=np.arange(1, clip.length + 1), success=clip.success)
+    return pd.DataFrame(rows[: clip.length]).assign(step=np.arange(1, clip.length + 1), success=clip.success)
 
 
 def contrasts(spec: TaskSpec, base: Policy, decorated: Decorated, seeds: Sequence[int], count: int = 1, *,
@@ -175,13 +186,10 @@ def contrasts(spec: TaskSpec, base: Policy, decorated: Decorated, seeds: Sequenc
     for seed in seeds[:tries]:
         if len(pairs) == count:
             break
-        base.reset(0)
-        failed = record(spec, base.act, seed, window=base.window, steps=steps, stride=stride, label="base")
+        (failed,) = record_all(spec, {"base": base}, seed, steps=steps, stride=stride)
         if failed.success.any():
             continue
-        decorated.reset(0)
-        solved = record(spec, decorated.act, seed, window=decorated.window, steps=steps, stride=stride,
-                        label="decorated")
+        (solved,) = record_all(spec, {"decorated": decorated}, seed, steps=steps, stride=stride)
         if solved.success.any():
             pairs.append((failed, solved))
     return pairs
@@ -257,17 +265,20 @@ def side_by_side(*clips: Clip) -> list[np.ndarray]:
     return [np.hstack([c[min(i, len(c) - 1)] for c in columns]) for i in range(max(map(len, columns)))]
 
 
-def write_video(frames: Sequence[np.ndarray], path: str | Path, *, fps: int = FPS,
+def write_video(frames: Sequence[np.ndarray], path: str | Path, *, fps: float = FPS,
                 limit: int = EMBED_BYTES) -> Path | None:
     """Write frames (height, width, 3) as an H.264 MP4 of at most about `limit` bytes, at a lower quality if need be.
 
-    Returns the path, or None where no encoder works: a video is an extra, like every picture.
+    A path that ends in .webp gets an animated picture of half the size, for pages that show no videos. Returns the path, or None where no
+    encoder works: a video is an extra, like every picture.
     """
     import mediapy
 
     path = Path(path)
     if not len(frames):
         raise PdkitError("A video needs at least one frame.")
+    if path.suffix == ".webp":
+        return _write_webp(frames, path, fps)
     height, width = (n - n % 2 for n in frames[0].shape[:2])  # H.264 halves the colour planes
     frames = [frame[:height, :width] for frame in frames]
     try:
@@ -285,6 +296,16 @@ def write_video(frames: Sequence[np.ndarray], path: str | Path, *, fps: int = FP
     return path
 
 
+def _write_webp(frames: Sequence[np.ndarray], path: Path, fps: float) -> Path:
+    from PIL import Image
+
+    pictures = [Image.fromarray(frame).resize((frame.shape[1] // 2, frame.shape[0] // 2)) for frame in frames]
+    with atomic_file(path) as temporary:
+        pictures[0].save(temporary, "WEBP", save_all=True, append_images=pictures[1:], duration=round(1000 / fps), loop=0, quality=20,
+                         method=6)
+    return path
+
+
 def video_tag(path: str | Path, caption: str = "") -> str:
     """HTML that plays a video with its bytes inside: for a page, or for a notebook as `HTML(video_tag(path))`."""
     from html import escape
@@ -292,3 +313,21 @@ def video_tag(path: str | Path, caption: str = "") -> str:
     data = base64.b64encode(Path(path).read_bytes()).decode()
     return (f'<video controls loop muted playsinline style="max-width:100%" title="{escape(caption, quote=True)}" '
             f'src="data:video/mp4;base64,{data}"></video>')
+
+
+def film(clips: Sequence[Clip], path: str | Path, caption: str = "", *, fps: int = 20) -> str:
+    """Write episodes next to each other as one MP4, and return the HTML that plays it (`video_tag`); "" where no encoder works."""
+    written = write_video(side_by_side(*clips), path, fps=fps)
+    return video_tag(written, caption) if written else ""
+
+
+def show(clips: Sequence[Clip], path: str | Path, caption: str = "", *, columns: int = 8) -> None:
+    """In a notebook: episodes as a contact sheet, and below it as a film side by side; kept as PATH.png and PATH.mp4."""
+    from IPython.display import HTML, display
+
+    path = Path(path)
+    sheet = contact_sheet(clips, columns)
+    sheet.savefig(path.with_suffix(".png"))
+    display(sheet)
+    if tag := film(clips, path.with_suffix(".mp4"), caption or ", ".join(clip.label for clip in clips) + ": the same episode"):
+        display(HTML(tag))

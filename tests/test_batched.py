@@ -211,14 +211,14 @@ class LikeAGPU:
 
 @pytest.mark.slow
 def test_a_policy_solves_as_much_with_the_arm_control_of_a_gpu():
-    """So policies trained in one world can be judged in the other: of 20 episodes of the shipped decorated policy, at most 3 differ."""
+    """So policies trained in one world can be judged in the other: of 10 episodes of the shipped decorated policy, at most 2 differ."""
     policy, spec = load_decorated(DATA / "checkpoints" / "StackCube" / "decorated"), get_task("StackCube")
     rates = []
     for world in (spec, dataclasses.replace(spec, make=LikeAGPU)):
         policy.reset(0)
-        table = evaluate(world, policy.act, selection_seeds(20), window=policy.window, chunk=policy.chunk, num_envs=4)
+        table = evaluate(world, policy.act, selection_seeds(10), window=policy.window, chunk=policy.chunk, num_envs=4)
         rates.append(table.success_once.sum())
-    assert min(rates) >= 16 and abs(rates[0] - rates[1]) <= 3
+    assert min(rates) >= 7 and abs(rates[0] - rates[1]) <= 2
 
 
 def test_a_lane_keeps_the_peg_that_it_was_built_with_where_another_episode_lies():

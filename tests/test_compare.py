@@ -11,6 +11,7 @@ from pdkit.claims import TooLittle
 from pdkit.errors import PdkitError
 from pdkit.files import DATA
 from pdkit.methods import METHODS
+from pdkit.seeds import reported_seeds
 from pdkit.sweep import load_spec
 
 
@@ -190,6 +191,8 @@ def test_an_own_run_is_a_recorded_row_and_is_made_once(tmp_path, monkeypatch):
     assert row.loc[0, ["task", "recipe", "seed", "episodes", "policy"]].tolist() == ["Door", "residual_rl", 3, 1, "bet"]
     assert {"base_jerk", "decorated_success", "updates", "env_steps"} <= set(row) and set(curve.recipe) == {"residual_rl"}
     assert curve.gate.eq(1).all() and row.env_steps[0] >= 260
+    before, after, episode = compare.before_and_after(row)
+    assert before.kind == "bet" and after.config.alpha == 1.0 and episode == reported_seeds(1)[0]
     monkeypatch.setattr(compare, "decorate", lambda *a: pytest.fail("it trained again"))
     again, _ = compare.own_run("residual_rl", "Door", "smoke", 3, tmp_path, 1, "mine", **settings)
     assert again.recipe[0] == "mine" and again.updates[0] == row.updates[0]

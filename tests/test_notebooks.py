@@ -40,6 +40,14 @@ def test_links_and_files_that_a_notebook_names_exist(name):
         assert (nb.NOTEBOOKS / target).exists(), target
 
 
+@pytest.mark.parametrize(("name", "following"), [*zip(NAMES, [*NAMES[1:], None], strict=True)])
+def test_every_notebook_ends_with_the_way_to_the_next(name, following):
+    texts = [cell.source for cell in nbformat.read(nb.find_notebook(name), 4).cells if cell.cell_type == "markdown"]
+    assert sum(len(re.findall(r"\bNext: ", text)) for text in texts) == 1
+    last = texts[-1].splitlines()[-1]
+    assert re.fullmatch(rf"Next: \[.*\]\({following}\.ipynb\)\." if following else "Next: nothing, this is the last notebook.*", last), last
+
+
 BUDGETS = [  # notebook, sweep, what its prose says of the sweep's [fixed] (leaderboard's JSRL: of its cell)
     ("08", "q_architectures", "{total_steps:,} steps, adapters"),
     ("09", "calql", "{calql_offline_updates:,} offline updates (half of the table's)"),
@@ -98,6 +106,12 @@ def test_policy_decorator_trains_once_and_is_reused(tmp_path):
     before = (tmp_path / "training" / "policy" / "actor.safetensors").stat().st_mtime_ns
     assert run("05", tmp_path, alpha=0.07)["success_once"] == result["success_once"]
     assert (tmp_path / "training" / "policy" / "actor.safetensors").stat().st_mtime_ns == before
+
+
+def test_policy_decorator_over_a_base_that_decides_on_chunks(tmp_path):
+    result = run("05", tmp_path, base="data/checkpoints/Door/diffusion", eval_episodes=1)
+    assert result["success_once"]["n"] == 1 and result["updates"] > 0 and "gamma" in result["changed"]
+    assert "--base" not in result["summary"][-1] and "base=data/checkpoints/Door/diffusion" in (tmp_path / "page.html").read_text()
 
 
 def test_unlearning(tmp_path):

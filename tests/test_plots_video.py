@@ -4,6 +4,7 @@ import os
 import re
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import matplotlib as mpl
 import numpy as np
@@ -12,6 +13,7 @@ import pytest
 from matplotlib.colors import to_hex
 
 from pdkit import page, plots, stats, video
+from pdkit.decorator import DecoratorConfig
 from pdkit.demos.format import Demos
 from pdkit.errors import PdkitError
 from pdkit.evaluate import timed
@@ -176,6 +178,14 @@ def test_record_tells_a_policy_the_time_that_asks_for_it():
     assert seen == [[0], [2], [4]]
 
 
+def test_trace_has_a_row_for_each_step_of_a_chunk():
+    parts = np.array([[0.1, -0.2, 0.3]]), np.array([[1.0, 0.0, -0.5]])
+    policy = SimpleNamespace(parts=lambda w: parts, reset=lambda s: None, window=1, chunk=3, config=DecoratorConfig(alpha=0.5))
+    rows = video.trace(COUNTER, policy, 1, steps=4)
+    assert rows.step.tolist() == [1, 2, 3, 4] and rows.base.tolist() == pytest.approx([0.1, 0.2, 0.3, 0.1])
+    assert rows.residual.tolist() == pytest.approx([0.5, 0, 0.25, 0.5]) and rows.success.tolist() == [False, False, True, True]
+
+
 def test_never_solved(clip):
     failed = video.Clip("Counter", 1, np.zeros(4, bool), clip.frames[:2], [0, 4])
     assert (failed.first_success, failed.outcome, failed.solved_by(99)) == (None, "not solved", False)
@@ -201,6 +211,38 @@ def test_side_by_side_pads_and_marks(clip):
     corner = tuple(frames[-1][0, 0])
     assert to_hex(np.array(corner) / 255) == plots.COLORS["gained"] and tuple(frames[-1][0, -1]) != corner
     assert (frames[-1][:, 80:] == frames[1][:, 80:]).all()
+
+
+class Still:
+    """A policy that always decides the same and remembers its resets."""
+
+    window, act = 2, staticmethod(actor)
+
+    def __init__(self):
+        self.resets = []
+
+    def reset(self, seed):
+        self.resets.append(seed)
+
+
+def test_one_episode_of_several_policies_is_a_sheet_and_a_film(tmp_path, monkeypatch):
+    import IPython.display
+    import mediapy
+
+    policies, shown = {"before": Still(), "after": Still()}, []
+    clips = video.record_all(COUNTER, policies, 5, steps=6, stride=2)
+    assert [(c.label, c.seed, c.steps) for c in clips] == [("before", 5, [0, 2, 4, 6]), ("after", 5, [0, 2, 4, 6])]
+    assert all(policy.resets == [0] for policy in policies.values())
+    tag = video.film(clips, tmp_path / "two.mp4", 'one "episode"')
+    assert tag.startswith("<video ") and "&quot;episode&quot;" in tag and mediapy.read_video(tmp_path / "two.mp4").shape == (4, 60, 160, 3)
+    monkeypatch.setattr(IPython.display, "display", shown.append)
+    video.show(clips, tmp_path / "episode")
+    assert (tmp_path / "episode.png").exists() and isinstance(shown[0], plots.Picture)
+    assert "before, after: the same episode" in shown[1].data
+    monkeypatch.setattr(video, "write_video", lambda *a, **k: None)
+    assert video.film(clips, tmp_path / "none.mp4") == ""
+    video.show(clips, tmp_path / "episode")
+    assert len(shown) == 3  # the sheet alone
 
 
 def test_video_is_small_h264_and_reads_back(tmp_path):

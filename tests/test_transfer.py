@@ -1,19 +1,22 @@
 """`pdkit evaluate`: a saved policy on the test episodes of several tasks, and the recorded gap between source and novel objects."""
 import dataclasses
+import types
 
+import mediapy
 import numpy as np
 import pandas as pd
 import pytest
 import torch
+from PIL import Image
 
 from pdkit import cli, recorded, transfer
 from pdkit.decorated import Decorated, save_decorated
 from pdkit.decorator import DecoratorConfig
 from pdkit.errors import PdkitError
-from pdkit.files import read_json
+from pdkit.files import DATA, read_json
 from pdkit.policies import save_policy
 from pdkit.policies.mlp import MLP
-from pdkit.probes import PROBES, ProbeBase
+from pdkit.probes import PROBES, ProbeBase, ReachSim, biased_base
 from pdkit.rl.networks import Actor
 from pdkit.stats import wilson
 
@@ -82,3 +85,39 @@ def test_the_command_records_a_row_a_task_for_base_and_decorated(tmp_path, monke
 def test_bad_words_are_told_in_one_sentence(words, message, capsys):
     assert cli.main(["evaluate", *words]) == 2
     assert message in capsys.readouterr().err
+
+
+class Drawn(ReachSim):
+    """A probe that can be drawn, in grey."""
+
+    def __init__(self, render=False): ...
+
+    def render(self):
+        return np.full((40, 60, 3), 128, np.uint8)
+
+
+@pytest.mark.parametrize("name", ["it.webp", "it.mp4"])
+def test_a_film_shows_a_decorated_policy_beside_its_base(tmp_path, monkeypatch, name):
+    spec = dataclasses.replace(PROBES["reach"], make=Drawn, suite="adroit", rate=40.0)
+    monkeypatch.setattr(transfer.video, "try_render", lambda spec: None)
+    lost, solves = biased_base(), straight()
+    decorated = types.SimpleNamespace(base=lost, act=solves.act, window=1, reset=lambda seed: None)
+    monkeypatch.setattr(transfer, "Decorated", types.SimpleNamespace)
+    path = transfer.film(decorated, spec, tmp_path / "films" / name, 20)
+    if name.endswith("webp"):
+        frames = Image.open(path)
+        frames.load()
+        assert frames.n_frames > 3 and frames.size == (60, 20) and frames.info["duration"] == 50  # side by side, half the size; 20 a second
+    else:
+        assert mediapy.read_video(path).shape[2] == 120
+    alone = transfer.film(solves, spec, tmp_path / f"alone-{name}", 1)
+    assert alone.stat().st_size > 0
+
+
+def test_films_that_cannot_be_made_are_refused_in_a_sentence(tmp_path, capsys, monkeypatch):
+    folder = str(DATA / "checkpoints" / "Door" / "base")
+    assert cli.main(["evaluate", folder, "--tasks", "reach", "far", "--film", str(tmp_path / "x.mp4")]) == 2
+    assert "name one task" in capsys.readouterr().err
+    monkeypatch.setenv("PDKIT_RENDER", "off")
+    assert cli.main(["evaluate", folder, "--tasks", "reach", "--film", str(tmp_path / "x.mp4")]) == 2
+    assert "turned off" in capsys.readouterr().err and not list(tmp_path.iterdir())

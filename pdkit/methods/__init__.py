@@ -30,7 +30,7 @@ _OWN_POLICY = dict(alpha=1.0, alpha_scale=(), H=0, residual_penalty=0.0)
 _TRANSFORMER = dict(batch=64, utd=0.125)
 
 # A U-Net with adapters, which also denoises in four steps for every target, so an update is slow: there are fewer, each with half of the
-# original's steps in actions. Not tuned: no recorded run on a task yet.
+# original's steps in actions. Not tuned; recorded once (data/results/diffusion_finetuning.csv, notebook 12).
 _DIFFUSION = dict(batch=64, utd=0.03, dipo_steps=10)
 
 # PPO learns from its own policy alone, with the learning rate falling from the start (as in cleanrl) and a spread that starts at 0.6
