@@ -56,13 +56,17 @@ class Finding:
 # ---- measuring -------------------------------------------------------------------------------------------------------
 
 def by_seed(table: pd.DataFrame, recipe: str, column: str) -> pd.Series:
-    """`column` of one recipe by (task, seed). Raises TooLittle below three seeds."""
+    """`column` of one recipe by (task, seed), on the tasks with three seeds of it. Raises TooLittle where there is none."""
     if column not in table:
         raise TooLittle(f"No column {column} is recorded.")
-    values = table[table.recipe == recipe].set_index(["task", "seed"])[column].dropna()
-    if values.index.get_level_values("seed").nunique() < LEAST_SEEDS:
+    values = _of_enough_seeds(table[table.recipe == recipe].set_index(["task", "seed"])[column].dropna())
+    if values.empty:
         raise TooLittle(f"Fewer than {LEAST_SEEDS} seeds of {recipe} are recorded.")
     return values
+
+
+def _of_enough_seeds(values: pd.Series) -> pd.Series:
+    return values[values.groupby(level="task").transform("size") >= LEAST_SEEDS]
 
 
 def average(values: pd.Series) -> float:
@@ -88,8 +92,8 @@ def task_by_task(values: pd.Series, show: Callable[[float], str]) -> str:
 
 def difference(first: pd.Series, second: pd.Series) -> tuple[Interval, pd.Series]:
     """Mean of first - second over the seeds that both have, with its interval; and the differences. Raises TooLittle."""
-    values = (first - second).dropna()
-    if values.index.get_level_values("seed").nunique() < LEAST_SEEDS:
+    values = _of_enough_seeds((first - second).dropna())
+    if values.empty:
         raise TooLittle(f"Fewer than {LEAST_SEEDS} seeds are recorded on both sides.")
     return mean_interval(values), values
 
@@ -172,6 +176,13 @@ METHOD = "Student's t over seeds, 95 %"
 
 def percent(value: float) -> str:
     return f"{100 * value:.1f} %"
+
+
+def not_counted(runs: pd.DataFrame) -> str:
+    """What is told behind a finding of the main job's rows that are too few, or of another kind, to be judged."""
+    told = [f"{task} ({kind}, {len(rows)} seed{'s' * (len(rows) > 1)}) {percent(rows.base_success.mean())} to "
+            f"{percent(rows.decorated_success.mean())}" for (task, kind), rows in runs.groupby(["task", "policy"])]
+    return f"; not counted: {', '.join(told)}" if told else ""
 
 
 def signed(value: float) -> str:

@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 
 from .errors import PdkitError
 from .files import DATA, atomic_file, read_json, write_json
+from .plots import save_small
 from .runs import describe_machine
 from .stats import wilson
 
@@ -41,7 +42,7 @@ def record(name: str, rows: pd.DataFrame, curves: pd.DataFrame) -> None:
         if len(tables) < 2 or not {"base_success", "decorated_success"} <= set(tables[0]):
             return
         with atomic_file(folder / f"{name}.png") as temporary:
-            figure(*tables, "Door" if "Door" in set(tables[0].task) else str(rows.task.iloc[0])).save_small(temporary)
+            save_small(figure(*tables, "Door" if "Door" in set(tables[0].task) else str(rows.task.iloc[0])), temporary)
 
 
 def load(name: str, task: str | None = None) -> tuple[pd.DataFrame, pd.DataFrame]:

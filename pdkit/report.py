@@ -27,7 +27,7 @@ from . import page, plots_range, task_range, verdicts
 from .cli import Parser
 from .errors import PdkitError
 from .files import DATA, atomic_file, runs_root
-from .plots import Picture
+from .plots import Picture, save_small
 from .recorded import KEYS
 
 COLUMNS = ["claim", "section", "tasks", "seeds", "measured", "interval", "verdict", "command"]
@@ -159,7 +159,7 @@ def main(argv: list[str]) -> int:
             claims.to_csv(temporary, index=False)
         if (folder / "main_job.csv").exists():
             with atomic_file(folder / "all_tasks.png") as temporary:
-                _range(_read(folder / "main_job.csv")).save_small(temporary)
+                save_small(_range(_read(folder / "main_job.csv")), temporary)
     claims, tables = load_claims(folder / "claims.csv"), recorded_tables(folder)
     problems = claim_problems(claims)
     for name, table in tables.items():

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import PdkitError
-from ..files import atomic_folder, read_json, runs_root
+from ..files import atomic_folder, read_json, runs_root, sha256
 from ..tasks import get_task
 from ..tasks.maniskill import building
 from ..tasks.maniskill_headless import make_env, quiet
@@ -33,6 +33,7 @@ HUB = ("StackCube", "PegInsertionSide")
 FILES = ("trajectory.h5", "trajectory.json")  # in the hub's archive, under ENVIRONMENT/motionplanning/
 TIMEOUT = 30  # seconds without a byte after which the hub counts as out of reach
 JOINTS, JOINT_TARGETS = "pd_joint_pos", 8  # ManiSkill's name of the control mode that is converted: 7 joints of the arm and the gripper
+MOST = 20e9  # bytes that an archive may unpack to
 SAME = 1e-4  # how far apart the numbers of two states may lie, metres and radians; other random numbers put bodies centimetres away
 LABELS = {"motionplanning": "scripted", "rl": "agent", "human": "human", "teleoperation": "human"}  # by ManiSkill's `source_type`
 
@@ -60,7 +61,12 @@ def from_hub(task: str, num: int, file: str | Path | None = None, progress: Call
         raise PdkitError(f"ManiSkill's hub has no demonstrations of {task}; it has those of: {', '.join(HUB)}.")
     spec = get_task(task)
     path = _trajectory_file(spec, Path(file) if file else None)
-    maker, episodes = read_trajectories(path, spec.make.env_id)
+    try:
+        maker, episodes = read_trajectories(path, spec.make.env_id)
+    except PdkitError:
+        if path.is_relative_to(runs_root() / "hub"):
+            shutil.rmtree(path.parent)  # so that the next call unpacks, or fetches, it anew
+        raise
     kept, elsewhere, tried = [], 0, 0
     for executed in _executed(spec, path, episodes):
         tried += 1
@@ -89,8 +95,9 @@ def _trajectory_file(spec: TaskSpec, given: Path | None) -> Path:
         raise PdkitError(f"{given} does not exist; --from takes the hub's .zip, or a trajectory.h5 with its trajectory.json beside it.")
     if given and given.suffix != ".zip":
         return given
-    folder = runs_root() / "hub" / spec.make.env_id
-    if given or not all((folder / name).is_file() for name in FILES):
+    # An archive that was given is kept apart from the hub's own: what it holds is anybody's.
+    folder = runs_root() / "hub" / (f"{spec.make.env_id}-{sha256(given)[:12]}" if given else spec.make.env_id)
+    if not all((folder / name).is_file() for name in FILES):
         with atomic_folder(folder) as fresh:
             archive = given or _fetched(spec, fresh / f"{spec.make.env_id}.zip")
             _unpack(archive, spec.make.env_id, fresh)
@@ -122,8 +129,11 @@ def _unpack(archive: Path, env_id: str, folder: Path) -> None:
             for name in map(PurePosixPath, opened.namelist()):
                 if name.is_absolute() or ".." in name.parts:
                     raise PdkitError(f"{archive.name} is not safe to use: it wants to write outside its own folder ({str(name)!r}).")
-            for name in FILES:
-                with opened.open(f"{env_id}/motionplanning/{name}") as member, open(folder / name, "wb") as file:
+            members = [opened.getinfo(f"{env_id}/motionplanning/{name}") for name in FILES]
+            if (size := sum(member.file_size for member in members)) > MOST:
+                raise PdkitError(f"{archive.name} would unpack to {size / 1e9:.0f} GB, more than the hub has; check where it is from.")
+            for name, info in zip(FILES, members, strict=True):
+                with opened.open(info) as member, open(folder / name, "wb") as file:
                     shutil.copyfileobj(member, file)
     except KeyError as error:
         raise PdkitError(f"{archive.name} is not the hub's archive of {env_id}: {error.args[0]}.") from None

@@ -7,7 +7,7 @@ Here it is stock ManiSkill that steps, not the fast step of maniskill.py. What d
 - Physics on a GPU does not repeat bit for bit, so neither does a training run, and a restored checkpoint puts lanes only nearly
   where they were.
 - Only training is simulated so. Every evaluation is made by the fast step on the CPU, in the world in which all policies of this
-  kit are compared. StackCube's shipped policies solve as much with either arm control (a slow test of tests/test_batched.py).
+  kit are compared. StackCube's shipped decorated policy solves about as much with either arm control (a slow test compares).
 - An episode starts where the fast step starts it for the same seed, but bodies cannot be built while the GPU simulates: a lane of
   PegInsertionSide keeps the peg and the box of its first episode, and only where they lie changes.
 - PhysX for CUDA changes how its process simulates on the CPU as well, so the lanes have a process of their own (see VectorEnv).

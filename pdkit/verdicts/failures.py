@@ -203,8 +203,8 @@ def _() -> Finding:
     interval = mean_interval(values)
     inside = max(abs(interval.low), abs(interval.high)) < 0.1
     return finding("unlearning", values, f"mean cosine with the improving direction {interval.value:+.3f}; drift after 200 updates "
-                   f"{drift.mean():.3f} of the action's unit", f"cosine {interval.low:+.3f} to {interval.high:+.3f} (percentile bootstrap "
-                   "over seeds, 95 %)", "reproduced" if inside and drift.min() > 0 else "partly" if abs(interval.value) < 0.1 else "not")
+                   f"{drift.mean():.3f} of the action's unit", f"cosine {interval.low:+.3f} to {interval.high:+.3f} ({METHOD})",
+                   "reproduced" if inside and drift.min() > 0 else "partly" if abs(interval.value) < 0.1 else "not")
 
 
 @measures("Warm-starting the critic makes")

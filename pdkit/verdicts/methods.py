@@ -30,6 +30,7 @@ from ..claims import (
     judged,
     matched,
     mean_interval,
+    not_counted,
     percent,
     points,
     recorded,
@@ -64,13 +65,11 @@ def _lifted(suites: tuple[str, ...]) -> Finding:
     table, _ = recorded("main_job")
     wanted = [task for suite in suites for task in TASKS[suite]]
     runs = table[table.task.isin(wanted)].assign(recipe=DECORATOR)
-    judged_here = (runs.policy == "bet") & (runs.groupby("task").seed.transform("nunique") >= LEAST_SEEDS)
+    judged_here = (runs.policy == "bet") & (runs.groupby(["task", "policy"]).seed.transform("nunique") >= LEAST_SEEDS)
     end, start = (by_seed(runs[judged_here], DECORATOR, column) for column in ("decorated_success", "base_success"))
     (gain, values), level = difference(end, start), mean_interval(end)
-    beside = ", ".join(f"{task} ({rows.policy.iloc[0]}, {len(rows)} seed{'s' * (len(rows) > 1)}) {percent(rows.base_success.mean())} to "
-                       f"{percent(rows.decorated_success.mean())}" for task, rows in runs[~judged_here].groupby("task"))
     return finding("main_job", values, f"from {percent(average(start))} to {percent(average(end))}{task_by_task(end, percent)}"
-                   + (f"; not counted: {beside}" if beside else ""), f"gain {points(gain)}",
+                   + not_counted(runs[~judged_here]), f"gain {points(gain)}; level {percent(level.low)} to {percent(level.high)}",
                    jointly(judged(gain), judged(level, NEARLY)), wanted)
 
 
@@ -197,9 +196,10 @@ def _() -> Finding:
         raise TooLittle("No fine-tuning method is recorded.")
     fallen = [recipe for recipe, (drop, _) in drops.items() if judged(turned(drop), 0.1) == "reproduced"]
     middle = sorted(drops, key=lambda recipe: drops[recipe][0].value)[(len(drops) - 1) // 2]
-    interval, values = drops[middle]
-    told = ", ".join(f"{recipe} {100 * drop.value:+.1f}" for recipe, (drop, _) in drops.items())
-    return finding("leaderboard", values, f"{len(fallen)} of {len(drops)} methods fall; points at the first evaluation against the start: "
+    interval, _ = drops[middle]
+    told = ", ".join(f"{recipe} {signed(drop.value)}{task_by_task(each, signed)}" for recipe, (drop, each) in drops.items())
+    every = pd.concat([each for _, each in drops.values()])  # tasks, seeds and commands of all of them
+    return finding("leaderboard", every, f"{len(fallen)} of {len(drops)} methods fall; points at the first evaluation against the start: "
                    f"{told}", f"{middle} (the middle one): {points(interval)}",
                    "reproduced" if len(fallen) > max(1, len(drops) / 2) else "partly" if fallen else "not")
 
@@ -274,7 +274,7 @@ def _() -> Finding:
     interval, values = difference(vinn, bet / 2)
     told = f"VINN {percent(average(vinn))}, BeT {percent(average(bet))}, FISH on VINN {percent(average(end))}"
     return finding("leaderboard", values, told,
-                   f"VINN less half of BeT: {points(interval)}", "not" if end.mean() >= bet.mean() else judged(turned(interval)), EIGHT)
+                   f"VINN less half of BeT: {points(interval)}", "not" if average(end) >= average(bet) else judged(turned(interval)), EIGHT)
 
 
 def _extremely_poor(features: str) -> Finding:
