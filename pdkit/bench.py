@@ -5,9 +5,9 @@ reported beside the medians. Absolute numbers tell about this machine at this ho
 """
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -23,6 +23,7 @@ from .demos.sources import bundled
 from .files import DATA, write_json
 from .gradient_steps import GradientSteps, gradient_step, make_optimizer
 from .imitate import ImitateConfig, Windows
+from .pixel_analysis import backend, why_not
 from .pixels.sim import PixelSim
 from .policies import POLICIES
 from .profiles import online_config
@@ -31,12 +32,10 @@ from .rl.sac import SAC, SACConfig
 from .runs import describe_machine
 from .tasks import get_task
 from .tasks.faucet import StockTurnFaucetSource
-from .tasks.maniskill_headless import render_device
 from .tasks.peg import StockPegInsertionSide
 from .tasks.stack_cube import StockStackCube
 from .tasks.vector import VectorEnv
 from .torch_setup import has_bf16, pick_device, set_threads
-from .video import try_render
 
 PARTS = ("step", "updates", "base", "imitation", "pictures", "profiles")
 
@@ -117,16 +116,13 @@ def bench_pictures(seconds: float) -> dict[str, Any]:
     """
     out = {}
     for task in (name for suite in TASKS.values() for name in suite):
-        spec = get_task(task)
-        if reason := try_render(replace(spec, plan_view=False)):
+        if reason := why_not(task):
             print(f"{task} is not measured. {reason}", flush=True)
             continue
-        backend = os.environ.get("MUJOCO_GL", "its default") if spec.suite == "adroit" else f"Vulkan, {render_device()}"
-        seen, alone = PixelSim(spec), spec.make()
-        out[f"{task}: simulated and drawn ({backend}) / simulated, one process (steps/s)"] = paired(
-            sim_stepper(seen, spec.act_dim), sim_stepper(alone, spec.act_dim), seconds)
-        seen.close()
-        alone.close()
+        spec = get_task(task)
+        with closing(PixelSim(spec)) as seen, closing(spec.make()) as alone:
+            out[f"{task}: simulated and drawn ({backend(task)}) / simulated, one process (steps/s)"] = paired(
+                sim_stepper(seen, spec.act_dim), sim_stepper(alone, spec.act_dim), seconds)
     return out
 
 

@@ -255,7 +255,7 @@ def missing(jobs: Sequence[Job], name: str) -> list[Job]:
 
 
 def essence(command: str) -> tuple[str, ...]:
-    """The parts of a command on which its row depends, in an order of their own: all of another one's than `pdkit train decorated`."""
+    """The parts of a command on which its row depends, sorted; a command other than `pdkit train decorated` counts as it stands."""
     head, *options = command.split(" --")
     if not head.startswith("pdkit train decorated"):
         return (command,)

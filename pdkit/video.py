@@ -269,16 +269,16 @@ def write_video(frames: Sequence[np.ndarray], path: str | Path, *, fps: float = 
                 limit: int = EMBED_BYTES) -> Path | None:
     """Write frames (height, width, 3) as an H.264 MP4 of at most about `limit` bytes, at a lower quality if need be.
 
-    A path that ends in .webp gets an animated picture of half the size, for pages that show no videos. Returns the path, or None where no
-    encoder works: a video is an extra, like every picture.
+    A path that ends in .webp gets an animated picture of half the size and one quality, whatever the limit, for pages that show no videos.
+    Returns the path, or None where no encoder works: a video is an extra, like every picture.
     """
-    import mediapy
-
     path = Path(path)
     if not len(frames):
         raise PdkitError("A video needs at least one frame.")
     if path.suffix == ".webp":
         return _write_webp(frames, path, fps)
+    import mediapy
+
     height, width = (n - n % 2 for n in frames[0].shape[:2])  # H.264 halves the colour planes
     frames = [frame[:height, :width] for frame in frames]
     try:

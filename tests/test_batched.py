@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
-from test_vector import COUNT, CountSim
+from test_vector import COUNT, CountSim, counting_seeds
 
 from pdkit.decorated import load_decorated
 from pdkit.errors import PdkitError
@@ -65,16 +65,6 @@ def both(spec, num_envs, queue_of, **rules):
     return [VectorEnv(spec, num_envs, queue_of(), simulator=simulator, **rules) for simulator in ("cpu", "side by side")]
 
 
-def endless():
-    """Seeds without end, other ones for every lane."""
-    counts = [0, 0, 0]
-
-    def next_seed(lane):
-        counts[lane] += 1
-        return 100 * lane + counts[lane]
-    return next_seed
-
-
 def scarce():
     """Four episodes for three lanes, so that lanes become idle."""
     queue = [4, 3, 2, 1]
@@ -90,7 +80,7 @@ def same(one, other):
 
 @pytest.mark.parametrize("rules", [{}, {"chunk": 3}, {"chunk": 3, "terminate_on_success": True}, {"success_tail": 2},
                                    {"chunk": 2, "window": 3, "success_tail": 1}])
-@pytest.mark.parametrize("seeds", [endless, scarce])
+@pytest.mark.parametrize("seeds", [counting_seeds, scarce])
 def test_lanes_together_report_what_lanes_apart_report(rules, seeds):
     rng, finished = np.random.default_rng(0), 0
     apart, together = both(COUNT, 3, seeds, **rules)
@@ -106,7 +96,7 @@ def test_lanes_together_report_what_lanes_apart_report(rules, seeds):
 
 def test_together_a_real_task_is_the_same_to_the_last_bit():
     rng = np.random.default_rng(0)
-    apart, together = both(get_task("StackCube"), 2, endless, chunk=2, window=2, max_episode_steps=5)
+    apart, together = both(get_task("StackCube"), 2, counting_seeds, chunk=2, window=2, max_episode_steps=5)
     with apart, together:
         assert np.array_equal(apart.reset(), together.reset())
         for _ in range(8):
@@ -131,8 +121,8 @@ def test_a_snapshot_brings_lanes_of_different_ages_back():
     spec = dataclasses.replace(COUNT, make=AccountSim, max_episode_steps=5)
     rng, ages = np.random.default_rng(1), set()
     for steps in range(1, 8):
-        first = VectorEnv(spec, 3, endless(), terminate_on_success=True, window=3, simulator="side by side")
-        with first, VectorEnv(spec, 3, endless(), terminate_on_success=True, window=3, simulator="side by side") as second:
+        first = VectorEnv(spec, 3, counting_seeds(), terminate_on_success=True, window=3, simulator="side by side")
+        with first, VectorEnv(spec, 3, counting_seeds(), terminate_on_success=True, window=3, simulator="side by side") as second:
             first.reset()
             for _ in range(steps):
                 first.step(rng.uniform(-1, 0.7, (3, 1, 1)))
@@ -277,10 +267,10 @@ def test_what_cannot_be_simulated_together_is_refused_with_what_to_do(monkeypatc
     base = POLICIES["mlp"](dict(obs_dim=39, act_dim=28, hidden=8))
     for spec in (get_task("Door"), get_task("TurnFaucet"), horizon_spec(get_task("StackCube"), 0.5)):
         with pytest.raises(PdkitError, match="^physx_cuda simulates StackCube and PegInsertionSide.*set simulator=cpu"):
-            VectorEnv(spec, 2, endless(), simulator="physx_cuda")  # from the process that simulates
+            VectorEnv(spec, 2, counting_seeds(), simulator="physx_cuda")  # from the process that simulates
     with pytest.raises(PdkitError, match="^physx_cuda simulates"):
         Trainer(OnlineConfig(task="Door", simulator="physx_cuda"), base)  # before anything is made
-    for make in (OnlineConfig, lambda simulator: VectorEnv(COUNT, 1, endless(), simulator=simulator)):
+    for make in (OnlineConfig, lambda simulator: VectorEnv(COUNT, 1, counting_seeds(), simulator=simulator)):
         with pytest.raises(PdkitError, match="Unknown simulator 'physx'"):
             make(simulator="physx")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)

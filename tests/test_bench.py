@@ -74,7 +74,7 @@ def test_parts_of_the_benchmark_can_be_measured_alone(tmp_path, capsys):
 
 def test_pictures_are_timed_where_they_can_be_drawn_and_what_cannot_is_said(monkeypatch, capsys):
     monkeypatch.setattr(bench, "TASKS", {"some": ("Door", "StackCube")})
-    monkeypatch.setattr(bench, "try_render", lambda spec: None if spec.name == "Door" else "There is no driver.")
+    monkeypatch.setattr(bench, "why_not", lambda task: None if task == "Door" else "There is no driver.")
 
     class Seen:
         """Draws nothing, at half the speed."""

@@ -67,7 +67,6 @@ class ManiSkillBatch:
         spec: StackCube or PegInsertionSide as they are in the registry.
         num_envs: N.
         backend: ManiSkill's name of what simulates. "physx_cpu" takes one lane: so the tests compare it with the fast step.
-
     """
 
     def __init__(self, spec: TaskSpec, num_envs: int, backend: str = "physx_cuda"):

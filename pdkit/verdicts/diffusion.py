@@ -29,6 +29,7 @@ from ..claims import (
     points,
     recorded,
     set_against,
+    signed,
 )
 from ..task_range import DIFFUSION
 from .registry import EIGHT, measures
@@ -60,7 +61,7 @@ def _() -> Finding:
     records, table = _recorded()
     end, start = (by_seed(table, DECORATOR, column) for column in ("decorated_success", "base_success"))
     gain, values = difference(end, start)
-    return finding(records, values, f"{percent(average(start))} to {percent(average(end))}: {100 * gain.value:+.1f} points", points(gain),
+    return finding(records, values, f"{percent(average(start))} to {percent(average(end))}: {signed(gain.value)} points", points(gain),
                    jointly(judged(gain), judged(mean_interval(end), NEARLY)), EIGHT)
 
 

@@ -124,7 +124,7 @@ def _gain(recipe: str) -> tuple[Interval, pd.Series]:
 def _largest_gain(method: str, kinds: Sequence[str]) -> tuple[Interval, pd.Series, str]:
     """That of the architecture with the largest mean; and all of them in words."""
     found = {kind: _gain(f"{method},critic_backbone={kind}") for kind in kinds}
-    told = ", ".join(f"{kind} {100 * interval.value:+.1f}" for kind, (interval, _) in found.items())
+    told = ", ".join(f"{kind} {signed(interval.value)}" for kind, (interval, _) in found.items())
     interval, values = max(found.values(), key=lambda gain: gain[0].value)
     return interval, values, f"points gained over the base policy: {told}"
 
@@ -191,7 +191,7 @@ def _() -> Finding:
     interval, values = difference(ours, theirs)
     inside = -0.1 < interval.low and interval.high < 0.1
     return finding("unlearning", values, f"modified {percent(ours.mean())}, original {percent(theirs.mean())}: "
-                   f"{100 * interval.value:+.1f} points", points(interval),
+                   f"{signed(interval.value)} points", points(interval),
                    "reproduced" if inside else "partly" if abs(interval.value) < 0.1 else "not", EIGHT)
 
 
@@ -238,7 +238,7 @@ def _() -> Finding:
     told_apart(plain, warm)
     interval, values = difference(plain, warm)
     told = (f"mean success at equal numbers of the actor's updates: without {percent(plain.mean())}, with a warm start and a fixed "
-            f"temperature {percent(warm.mean())}: {100 * interval.value:+.1f} points")
+            f"temperature {percent(warm.mean())}: {signed(interval.value)} points")
     return finding("warm_finetuning", values, told, points(interval), judged(interval))
 
 

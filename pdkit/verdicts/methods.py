@@ -109,7 +109,7 @@ def _() -> Finding:
     end, start = (by_seed(table, rival, column) for column in ("decorated_success", "base_success"))
     interval, values = difference(end, start)
     return finding("leaderboard", values, f"{rival} {percent(average(end))}, its start {percent(average(start))}: "
-                   f"{100 * interval.value:+.1f} points{_besides(table)}", points(interval), judged(turned(interval)), TASKS["adroit"])
+                   f"{signed(interval.value)} points{_besides(table)}", points(interval), judged(turned(interval)), TASKS["adroit"])
 
 
 @measures("The best baseline that fine-tunes BeT reaches 0 %")
@@ -132,7 +132,7 @@ def _() -> Finding:
                                by_seed(table, DECORATOR, "base_success"))
     interval, values = difference(end, base)
     told = (f"{rival} {percent(average(end))} (it starts at {percent(average(start))}), BeT base {percent(average(base))}: "
-            f"{100 * interval.value:+.1f} points")
+            f"{signed(interval.value)} points")
     return finding("leaderboard", values, told, points(interval), judged(turned(interval)), TASKS["adroit"])
 
 

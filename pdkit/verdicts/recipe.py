@@ -23,6 +23,7 @@ from ..claims import (
     points,
     recorded,
     set_against,
+    signed,
     weakest,
 )
 from ..demos import sources
@@ -70,7 +71,7 @@ def _() -> Finding:
     gain, _ = difference(ends, by_seed(table, wide, "base_success"))
     verdict = weakest(judged(interval, -0.1), judged(gain), "partly")
     return finding("ablations", values, f"H=40000 (all of the training) {percent(ends.mean())}, H=20000 {percent(own.mean())}: "
-                   f"{100 * interval.value:+.1f} points; {100 * gain.value:+.1f} over the base policy", points(interval), verdict)
+                   f"{signed(interval.value)} points; {signed(gain.value)} over the base policy", points(interval), verdict)
 
 
 @measures("alpha close to the scale of the demonstrated actions")
@@ -81,7 +82,7 @@ def _() -> Finding:
     found = {name: (scale, *alpha_works(table, scale)) for name, scale in action_scales(sources.bundled("Door")).items()}
     known = {verdict for _, verdict, _, _ in found.values()}
     interval = min((behind for _, _, behind, _ in found.values()), key=lambda behind: behind.value)
-    told = "; ".join(f"{name} {scale:.2f}: {near.split(',')[0]} {100 * behind.value:+.1f} points against the best bound ({verdict})"
+    told = "; ".join(f"{name} {scale:.2f}: {near.split(',')[0]} {signed(behind.value)} points against the best bound ({verdict})"
                      for name, (scale, verdict, behind, near) in found.items())
     values = by_seed(table, next(near for *_, near in found.values()), "decorated_success")
     return finding("ablations", values, told, f"the lower one: {points(interval)}", jointly(*known))
