@@ -17,6 +17,7 @@ from pdkit.online import Trainer
 from pdkit.online_config import OnlineConfig
 from pdkit.policies import POLICIES
 from pdkit.profiles import flat
+from pdkit.rl.sac import SACConfig
 from pdkit.runs import Run
 from pdkit.seeds import selection_seeds
 from pdkit.tasks import batched, get_task
@@ -249,7 +250,7 @@ def test_a_run_trains_on_the_batched_step_and_resumes(tmp_path):
     base = POLICIES["mlp"](dict(obs_dim=spec.obs_dim, act_dim=spec.act_dim, hidden=8))
     config = OnlineConfig(task="StackCube", simulator="stock", num_envs=1, env_workers=1, eval_workers=0, total_steps=120,
                           warmup_steps=40, batch=16, utd=0.1, demo_fraction=0.0, eval_every=0, log_every=40, train_limit=30,
-                          checkpoint_every=50)
+                          checkpoint_every=50, sac=SACConfig(hidden=16, layers=2, bf16=False))
 
     def killed(trainer):
         if trainer.step >= 80:
