@@ -97,13 +97,18 @@ def _help() -> str:
 
 
 def test(argv: list[str]) -> int:
-    """`pdkit test [pytest arguments]`: paths are relative to the project folder, wherever it is called from."""
+    """`pdkit test [pytest arguments]`: paths are relative to the project folder, wherever it is called from.
+
+    All tests together share the cores (pytest-xdist); those of a path that is given run one after the other, as does all with `-n 0`.
+    """
     for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
         os.environ[name] = "1"  # before torch and numpy load: tests are small, and threads only get in each other's way
     import pytest
 
     os.chdir(ROOT)
-    return int(pytest.main(argv))
+    alone = any(os.path.exists(a.split("::")[0]) for a in argv) or any(a == "--pdb" or a.startswith(("-n", "--numprocesses")) for a in argv)
+    workers = min(4, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
+    return int(pytest.main(argv if alone or workers < 2 else ["-n", str(workers), "--dist", "worksteal", *argv]))
 
 
 def lab(argv: list[str]) -> int:

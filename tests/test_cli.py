@@ -1,4 +1,5 @@
 """The command line: fast, one sentence for each mistake, the right exit codes."""
+import os
 import subprocess
 import sys
 import time
@@ -74,6 +75,23 @@ def test_the_test_verb_runs_pytest_with_one_thread_and_passes_arguments_on(tmp_p
     monkeypatch.setenv("OMP_NUM_THREADS", "7")  # the verb's own setting wins
     assert pdkit("test", *plain, "-k", "test_a").returncode == 0
     assert pdkit("test", *plain).returncode == 1
+
+
+SHARED = ["--dist", "worksteal"]
+
+
+@pytest.mark.parametrize("cores, argv, before", [
+    (2, ["--slow"], ["-n", "2", *SHARED]), (64, [], ["-n", "4", *SHARED]), (2, ["-k", "sac"], ["-n", "2", *SHARED]),
+    (1, [], []), (2, ["tests/test_cli.py::test_lab"], []), (2, ["-n", "0"], []), (2, ["--pdb"], []),
+])
+def test_all_tests_share_the_cores_and_those_of_a_path_do_not(monkeypatch, cores, argv, before):
+    called = []
+    monkeypatch.setattr(pytest, "main", lambda argv: called.extend(argv) or 0)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: set(range(cores)), raising=False)
+    monkeypatch.chdir(cli.ROOT)
+    for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+        monkeypatch.setenv(name, "1")  # put back afterwards
+    assert cli.test(argv) == 0 and called == [*before, *argv]
 
 
 def test_lab_opens_the_notebooks_folder(monkeypatch, tmp_path):
