@@ -127,7 +127,7 @@ def sections(claims: pd.DataFrame, tables: dict[str, pd.DataFrame], folder: Path
     tested, rest = claims[claims.verdict != "untested"], claims[claims.verdict == "untested"]
     parts = [page.Section("Verdicts", [page.numbers([(str(n), verdict, VERDICTS[verdict]) for verdict, n in counts(claims).items()])])]
     if "main_job" in tables:
-        parts.append(page.Section("All tasks", [page.figure(_range(tables["main_job"]), "base and decorated policies of the main job")]))
+        parts.append(page.Section("All tasks", [page.figure(_range(tables), "base and decorated policies of the main job")]))
     parts.append(page.Section("Tested", [page.table(tested.to_dict("records")) if len(tested) else "Nothing yet."]))
     if len(rest):
         parts.append(page.Section("Untested", [page.table(rest[["claim", "section", "tasks"]].to_dict("records"))]))
@@ -141,8 +141,8 @@ def sections(claims: pd.DataFrame, tables: dict[str, pd.DataFrame], folder: Path
     return parts
 
 
-def _range(table: pd.DataFrame) -> Picture:
-    tasks = task_range.by_task(table)
+def _range(tables: dict[str, pd.DataFrame]) -> Picture:
+    tasks = task_range.by_task(task_range.over_bets(tables["main_job"], tables.get("bet_bases", pd.DataFrame())))
     return plots_range.range_figure(tasks, task_range.averages(tasks), "Base policies and decorated ones, best evaluation of a run")
 
 
@@ -157,10 +157,10 @@ def main(argv: list[str]) -> int:
         claims = verdicts.updated(load_claims(folder / "claims.csv"))
         with atomic_file(folder / "claims.csv") as temporary:
             claims.to_csv(temporary, index=False)
-        if (folder / "main_job.csv").exists():
-            with atomic_file(folder / "all_tasks.png") as temporary:
-                save_small(_range(_read(folder / "main_job.csv")), temporary)
     claims, tables = load_claims(folder / "claims.csv"), recorded_tables(folder)
+    if args.update and "main_job" in tables:
+        with atomic_file(folder / "all_tasks.png") as temporary:
+            save_small(_range(tables), temporary)
     problems = claim_problems(claims)
     for name, table in tables.items():
         problems += table_problems(name, table, folder)

@@ -1,7 +1,8 @@
 """All tasks in one table: demonstrations, base policy, decorated policy, beside the paper's averages (Fig. 1).
 
 The paper gives averages over tasks only; what it has for a single task is not known, and none is invented here. The recorded runs are
-those of the main job (data/results/main_job.csv): the decorator's best evaluation on selection episodes, tested on others.
+those of the main job (data/results/main_job.csv): the decorator's best evaluation on selection episodes, tested on others. Where the main
+job's own base is no BeT, as the paper's are, but one was decorated by the same recipe (bet_bases.csv), those runs stand for the task.
 """
 from __future__ import annotations
 
@@ -29,6 +30,11 @@ PAPER_DIFFUSION = (52.55, 99.9)  # percent, the mean over six tasks (Fig. 1): ba
 COLUMNS = ["task", "suite", "policy", "demos", "label", "seeds", "episodes", "env_steps", "base", "base_low", "base_high", "decorated",
            "low", "high", "at_end"]
 ENOUGH = 3  # seeds below which the interval is the test episodes' alone
+
+
+def over_bets(jobs: pd.DataFrame, bets: pd.DataFrame) -> pd.DataFrame:
+    """Rows of main_job.csv, but on the tasks of bet_bases.csv that one's."""
+    return pd.concat([jobs[~jobs.task.isin(bets.task)], bets], ignore_index=True) if len(bets) else jobs
 
 
 def by_task(table: pd.DataFrame) -> pd.DataFrame:

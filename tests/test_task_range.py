@@ -28,6 +28,14 @@ def test_every_task_of_the_paper_has_a_row(tasks):
     assert known.loc["TurnFaucet", "label"] == "scripted, other objects" and known.loc["Pen", "label"] == "agent"
 
 
+def test_a_decorated_bet_stands_for_a_task_whose_main_job_has_another_base():
+    jobs = pd.DataFrame([dict(task=task, policy="mlp", seed=seed) for task in ("Pen", "StackCube") for seed in range(3)])
+    bets = pd.DataFrame([dict(task="StackCube", policy="bet-sac", seed=0)])
+    shown = task_range.over_bets(jobs, bets)
+    assert shown.task.tolist() == ["Pen"] * 3 + ["StackCube"] and shown.policy.tolist() == ["mlp"] * 3 + ["bet-sac"]
+    assert task_range.over_bets(jobs, pd.DataFrame()) is jobs
+
+
 def test_averages_are_over_what_is_recorded(tasks):
     means = task_range.averages(tasks).set_index("over")
     assert means.loc["all", "tasks"] == "2 of 8" and means.loc["all", "decorated"] == pytest.approx(0.875)

@@ -310,6 +310,18 @@ def test_a_decorated_mlp_is_no_decorated_bet(results):
     assert all(verdicts.find(f"Policy Decorator lifts BeT bases from {start} %") is None for start in ("41.5", "36.25"))
 
 
+def test_a_bet_decorated_beside_the_main_job_stands_for_its_task(results):
+    """In the form that SAC can tune, too. The main job's own runs over an MLP are then neither counted nor told."""
+    write(results, "main_job", runs("lesson", [0.99] * 3, policy="mlp", task="StackCube", command="x"),
+          runs("lesson", [0.7, 0.71, 0.69], task="Hammer", command="x"))
+    write(results, "bet_bases", runs("lesson", [0.9, 0.91, 0.89], policy="bet-sac", task="StackCube", command="y"))
+    found = verdicts.find("Policy Decorator lifts BeT bases from 41.5 % to 98.95 % success")
+    assert "(Hammer 70.0 %, StackCube 90.0 %)" in found.measured and "mlp" not in found.measured
+    assert "bet_bases.toml" in found.command and "main_job.toml" in found.command
+    suites = verdicts.find("Policy Decorator lifts BeT bases from 36.25 %")
+    assert suites.measured.startswith("ManiSkill from 50.0 % to 90.0 %")
+
+
 @pytest.mark.parametrize("ends, verdict", [([0.9, 0.8, 0.85], "partly"), ([0.95, 0.4, 0.9], "partly"), ([0.3, 0.4, 0.35], "not")])
 def test_novel_objects_and_the_mlp_below_them(results, ends, verdict):
     """TurnFaucet alone is one of two tasks; its runs also answer for an MLP where no sweep of base policies does, above 20 points."""

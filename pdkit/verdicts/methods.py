@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 
 from ..claims import (
+    BETS,
     DECORATOR,
     FINE_TUNING,
     LEAST_SEEDS,
@@ -42,6 +43,7 @@ from ..claims import (
 )
 from ..residual_analysis import late_ratio
 from ..stats import wilson
+from ..task_range import over_bets
 from .registry import EIGHT, measures
 
 # ---- the comparison of methods (leaderboard) --------------------------------------------------------------------------
@@ -49,7 +51,7 @@ from .registry import EIGHT, measures
 def _on_bet(kind: str = "") -> pd.DataFrame:
     """The leaderboard on those tasks (of one kind: adroit, maniskill) where the decorator's own base policy is a BeT."""
     table, _ = recorded("leaderboard")
-    bets = set(table.task[(table.recipe == DECORATOR) & (table.policy == "bet")])
+    bets = set(table.task[(table.recipe == DECORATOR) & table.policy.isin(BETS)])
     return table[table.task.isin(bets & set(TASKS[kind] if kind else EIGHT))]
 
 
@@ -61,14 +63,19 @@ def _besides(table: pd.DataFrame) -> str:
 
 def _lifted(suites: tuple[str, ...]) -> Finding:
     """Lifted: more success than the base policy, and NEARLY all on average, over the tasks with three seeds whose base policy is a BeT.
-    What was recorded on the others (ManiSkill's base policies here are MLPs, and some have one seed) is told beside it."""
-    table, _ = recorded("main_job")
+    What was recorded on the others (some of ManiSkill's base policies here are MLPs, and some have one seed) is told beside it."""
+    records = ("main_job", "bet_bases")
+    table, bets = recorded(records[0])[0], pd.DataFrame()
+    with contextlib.suppress(TooLittle):
+        bets = recorded(records[1])[0]
     wanted = [task for suite in suites for task in TASKS[suite]]
-    runs = table[table.task.isin(wanted)].assign(recipe=DECORATOR)
-    judged_here = (runs.policy == "bet") & (runs.groupby(["task", "policy"]).seed.transform("nunique") >= LEAST_SEEDS)
+    runs = over_bets(table, bets)
+    runs = runs[runs.task.isin(wanted)].assign(recipe=DECORATOR)
+    judged_here = runs.policy.isin(BETS) & (runs.groupby(["task", "policy"]).seed.transform("nunique") >= LEAST_SEEDS)
     end, start = (by_seed(runs[judged_here], DECORATOR, column) for column in ("decorated_success", "base_success"))
     (gain, values), level = difference(end, start), mean_interval(end)
-    return finding("main_job", values, f"from {percent(average(start))} to {percent(average(end))}{task_by_task(end, percent)}"
+    return finding(records if len(bets) else records[0], values,
+                   f"from {percent(average(start))} to {percent(average(end))}{task_by_task(end, percent)}"
                    + not_counted(runs[~judged_here]), f"gain {points(gain)}; level {percent(level.low)} to {percent(level.high)}",
                    jointly(judged(gain), judged(level, NEARLY)), wanted)
 
