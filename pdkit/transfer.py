@@ -1,6 +1,8 @@
 """`pdkit evaluate`: a saved policy on the test episodes of one task or several, such as on source and on novel objects (Fig. 12)."""
 from __future__ import annotations
 
+import argparse
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -12,6 +14,7 @@ from .cli import Parser
 from .decorated import Decorated, load_decorated
 from .errors import PdkitError
 from .evaluate import evaluate
+from .oracle import by_bound
 from .pixels.encoders import Encoder
 from .pixels.task import encoder_of, pixel_spec
 from .policies import Policy, load_policy
@@ -74,6 +77,26 @@ def film(policy: Policy | Decorated, spec: TaskSpec, path: str | Path, episodes:
     return written
 
 
+def corrected(kind: str, policy: Policy | Decorated, args: argparse.Namespace) -> int:
+    """`pdkit evaluate --oracle`: success by the bound (pdkit/oracle.py), printed, and recorded if asked, a row a task and bound."""
+    if kind != "base" or encoder_of(args.policy):
+        raise PdkitError("--oracle corrects a base policy that is told the state; name the folder of one.")
+
+    def progress(alpha: float, done: int) -> None:
+        if done % 10 == 0 or done == args.episodes:
+            print(f"\ralpha {alpha:g}: {done} of {args.episodes} episodes", end="\n" if done == args.episodes else "", file=sys.stderr)
+
+    for task in args.tasks:
+        rows = by_bound(get_task(task), policy, args.oracle, reported_seeds(args.episodes), progress)
+        for row in rows.itertuples():
+            print(f"{task}, corrected by at most {row.alpha:g}: {wilson(round(row.success * row.episodes), row.episodes)}")
+        if args.record:
+            again = [f"pdkit evaluate {args.policy} --tasks {task} --episodes {args.episodes} --oracle {alpha:g} --record {args.record}"
+                     for alpha in rows.alpha]
+            record(args.record, rows.assign(recipe=[f"alpha={alpha:g}" for alpha in rows.alpha], seed=0, command=again), pd.DataFrame())
+    return 0
+
+
 def main(argv: list[str]) -> int:
     parser = Parser(prog="pdkit evaluate", description="Success of a saved policy on the test episodes of one task or several.")
     parser.add_argument("policy", help="folder of a base policy or of a decorated one")
@@ -82,8 +105,12 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--record", help="name under data/results: a row a task is added to NAME.csv")
     parser.add_argument("--film", metavar="FILE", help="write an episode as FILE (.mp4 or .webp) instead, of a decorated policy one that "
                                                        "its base does not solve, side by side")
+    parser.add_argument("--oracle", nargs="+", type=float, metavar="ALPHA", help="success of a base policy that a demonstrator corrects by "
+                        "at most so much (0: not at all), instead: what a bound allows")
     parser.add_argument("--threads", type=int, default=1)
     args = parser.parse_args(argv)
+    if args.film and (args.oracle or args.record):
+        raise PdkitError("--film writes an episode and nothing else; leave --oracle and --record out.")
     if args.episodes < 1:
         raise PdkitError(f"--episodes must be at least 1, not {args.episodes}.")
     set_threads(args.threads)
@@ -93,6 +120,8 @@ def main(argv: list[str]) -> int:
             raise PdkitError("--film shows one task and policies that are told the state: name one task, and a policy without an encoder.")
         print(f"wrote {film(policy, get_task(args.tasks[0]), args.film, args.episodes)}")
         return 0
+    if args.oracle:
+        return corrected(kind, policy, args)
     rows = transfer(policy, args.tasks, args.episodes, encoder_of(args.policy))
     for row in rows.itertuples():
         print(f"{row.task}: {wilson(round(row.success * row.episodes), row.episodes)}; at the last step {row.success_at_end:.1%}")

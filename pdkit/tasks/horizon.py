@@ -147,7 +147,7 @@ def horizon_spec(spec: TaskSpec, fraction: float, ways: Callable[[], Ways] | Non
 
 # ---- who knows the way -----------------------------------------------------------------------------------------------
 
-class _Expert:
+class Scripted:
     """A scripted expert as a guide."""
 
     window = 1
@@ -172,7 +172,7 @@ def _demonstrator(task: str) -> Guide:
 def _scripted(task: str) -> Guide:
     from ..demos.experts import EXPERTS
 
-    return _Expert(EXPERTS[task]())
+    return Scripted(EXPERTS[task]())
 
 
 GUIDES: dict[str, Callable[[str], Guide]] = {"Door": _demonstrator, "StackCube": _scripted}
