@@ -1,4 +1,5 @@
 """Demonstrations of ManiSkill's hub: real trajectory files, recorded by ManiSkill's own wrapper, and what can be wrong with one."""
+import contextlib
 import io
 import json
 import shutil
@@ -160,6 +161,14 @@ def test_the_archive_is_fetched_once(copied, tmp_path, monkeypatch):
     assert given != path and given.read_bytes() == path.read_bytes()  # one that is given does not take the place of the hub's own
     maker, (episode,) = hub.read_trajectories(path, "StackCube-v1")
     assert (maker, episode.seed, episode.control) == ("motionplanning", SEED, hub.JOINTS) and episode.actions.shape[1] == 8
+
+
+def test_a_download_without_an_end_is_cut(copied, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(hub, "MOST", 2e6)
+    monkeypatch.setattr(urllib.request, "urlopen", lambda url, timeout: contextlib.closing(open("/dev/zero", "rb")))
+    assert cli.main(["demos", "StackCube", "--source", "hub"]) == 2
+    assert "more than the hub has" in capsys.readouterr().err
+    assert not [p for p in (tmp_path / "runs").rglob("*") if p.is_file()]
 
 
 def test_no_network_is_said_with_what_to_do(copied, tmp_path, monkeypatch, capsys):

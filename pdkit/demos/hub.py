@@ -33,7 +33,7 @@ HUB = ("StackCube", "PegInsertionSide")
 FILES = ("trajectory.h5", "trajectory.json")  # in the hub's archive, under ENVIRONMENT/motionplanning/
 TIMEOUT = 30  # seconds without a byte after which the hub counts as out of reach
 JOINTS, JOINT_TARGETS = "pd_joint_pos", 8  # ManiSkill's name of the control mode that is converted: 7 joints of the arm and the gripper
-MOST = 20e9  # bytes that an archive may unpack to
+MOST = 20e9  # bytes that an archive may have, or unpack to
 SAME = 1e-4  # how far apart the numbers of two states may lie, metres and radians; other random numbers put bodies centimetres away
 LABELS = {"motionplanning": "scripted", "rl": "agent", "human": "human", "teleoperation": "human"}  # by ManiSkill's `source_type`
 
@@ -114,7 +114,11 @@ def _fetched(spec: TaskSpec, path: Path) -> Path:
     print(f"fetching {url}", file=sys.stderr, flush=True)
     try:
         with urllib.request.urlopen(url, timeout=TIMEOUT) as answer, open(path, "wb") as file:
-            shutil.copyfileobj(answer, file)
+            while block := answer.read(1 << 20):
+                file.write(block)
+                if file.tell() > MOST:
+                    raise PdkitError(f"{url} gives more than {MOST / 1e9:.0f} GB, more than the hub has; look what it is, download it yourself "
+                                     "and name the file with --from.")
     except (urllib.error.URLError, http.client.HTTPException, TimeoutError, ConnectionError) as error:
         raise PdkitError(f"ManiSkill's demonstrations of {spec.name} could not be fetched ({getattr(error, 'reason', error)}); they need a "
                          f"network the first time: use the scripted expert's, `pdkit demos {spec.name}`, or download {url} where there is "
