@@ -333,6 +333,8 @@ def test_novel_objects_and_the_mlp_below_them(results, ends, verdict):
     assert (mlp.tasks, mlp.verdict) == ("TurnFaucet", "reproduced" if min(ends) >= 0.8 else "not" if max(ends) < 0.5 else "partly")
     write(results, "base_policies", runs("mlp", [0.6] * 3))
     assert verdicts.find("Policy Decorator significantly improves an MLP base policy.").tasks == "Door"
+    write(results, "base_policies", runs("mlp", [0.0] * 3, base=0.0))  # nothing to tell apart there: the main job does not stand in
+    assert verdicts.find("Policy Decorator significantly improves an MLP base policy.") is None
 
 
 @pytest.mark.parametrize("solved, verdict", [(0.9, "partly"), (0.5, "not")])

@@ -1,7 +1,6 @@
 """The decorator's parts, and other policies below it (data/sweeps/ablations.toml, base_policies.toml, low_checkpoint.toml)."""
 from __future__ import annotations
 
-import contextlib
 from dataclasses import replace
 from functools import partial
 
@@ -90,10 +89,18 @@ def _() -> Finding:
 
 # ---- other base policies ---------------------------------------------------------------------------------------------
 
+def _swept(recipe: str) -> bool:
+    """Whether the sweep of base policies has enough seeds of it, whatever they tell."""
+    try:
+        return bool(len(by_seed(recorded("base_policies")[0], recipe, "decorated_success")))
+    except TooLittle:
+        return False
+
+
 def _improves(recipe: str) -> Finding:
     """Significantly: by more than 20 points (ours, as for a low-performing checkpoint). The paper's task is TurnFaucet. Where the
     sweep of base policies has too few seeds, the main job's rows on TurnFaucet answer, whose best evaluated policy is tested."""
-    with contextlib.suppress(TooLittle):
+    if _swept(recipe):
         return compared("base_policies", recipe, second_column="base_success", enough=0.2, paper=("TurnFaucet",))
     runs = recorded("main_job")[0]
     runs = runs[(runs.task == "TurnFaucet") & (runs.policy == recipe)].assign(recipe=recipe)
