@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import copy
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,7 @@ import torch
 import torch.nn.functional as F
 
 from .claims import TooLittle, by_seed, difference, judged, mean_interval, turned, weakest
-from .errors import PdkitError
+from .errors import PdkitError, unknown
 from .evaluate import Actor
 from .rl.networks import Critics
 from .rl.replay import NStep, Replay
@@ -27,23 +28,49 @@ from .stats import wilson
 from .tasks.horizon import horizon_spec, steps_ahead, ways_of
 from .tasks.lanes import IDLE
 from .tasks.spec import TaskSpec
+from .tasks.stack_cube import CUBE
 from .tasks.vector import VectorEnv
 
-HINGE, REACH = 28, slice(35, 38)  # Door's observation: hinge in rad, palm minus handle in m
 RECIPE = re.compile(r"(?P<method>\w+),start_fraction=(?P<fraction>[\d.]+)")  # of data/sweeps/horizon.toml
 
 
 # ---- where episodes start --------------------------------------------------------------------------------------------
 
+@dataclass(frozen=True)
+class Progress:
+    """A number of an observation (obs_dim,) that tells how far an episode has come, and at which the task is solved, where one is."""
+
+    label: str  # with its unit
+    of: Callable[[np.ndarray], float]
+    solved: float | None = None
+
+
+PROGRESS: dict[str, dict[str, Progress]] = {  # by task and column of `starts`
+    "Door": {
+        "reach": Progress("palm to handle (m)", lambda o: float(np.linalg.norm(o[35:38]))),
+        "hinge": Progress("door hinge (rad)", lambda o: float(o[28]), 1.35),
+    },
+    "StackCube": {
+        "reach": Progress("gripper to red cube (m)", lambda o: float(np.linalg.norm(o[46:49]))),
+        "apart": Progress("red cube to its place on the green one (m)", lambda o: float(np.linalg.norm(-o[52:55] - (0, 0, CUBE)))),
+    },
+}
+
+
 def starts(spec: TaskSpec, fraction: float, seeds: Sequence[int]) -> pd.DataFrame:
-    """One row a seed of Door: ahead and left (steps of the guide before and after the start), hinge (rad), reach (palm to handle, m)."""
+    """One row a seed: ahead and left (steps of the guide before and after the start), and the task's columns of PROGRESS.
+
+    Raises PdkitError for a task that has none.
+    """
+    if spec.name not in PROGRESS:
+        raise unknown("task with starts on the way", spec.name, PROGRESS)
     sim, rows = horizon_spec(spec, fraction).make(), []
     try:
         for seed in seeds:
             length = len(ways_of(spec.name).way(sim, seed)[1])
             observation, ahead = sim.reset(seed), steps_ahead(length, fraction)
-            rows.append({"start_fraction": fraction, "seed": seed, "ahead": ahead, "left": length - ahead,
-                         "hinge": float(observation[HINGE]), "reach": float(np.linalg.norm(observation[REACH]))})
+            rows.append({"start_fraction": fraction, "seed": seed, "ahead": ahead, "left": length - ahead}
+                        | {column: progress.of(observation) for column, progress in PROGRESS[spec.name].items()})
     finally:
         sim.close()
     return pd.DataFrame(rows)

@@ -1,11 +1,14 @@
 """Figures of notebook 10: a quantity against the horizon, which is the share of the way to success that is left."""
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import matplotlib as mpl
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 
+from .horizon_analysis import Progress
 from .plots import COLORS, Picture, _columns, _percent, blank, styled
 from .plots_compare import PALETTE, over_seeds
 from .stats import wilson
@@ -21,18 +24,19 @@ def _horizons(ax: Axes, fractions) -> None:
 
 
 @styled
-def starts_figure(table: pd.DataFrame) -> Picture:
-    """How far along `horizon_analysis.starts` are: distance of palm and handle, door hinge; a dot a seed, a line for the mean."""
-    _columns(table, "start_fraction", "hinge", "reach")
-    figure, axes = blank(1, 2, (8.6, 3.2))
-    for ax, column, label in zip(axes[0], ("reach", "hinge"), ("palm to handle (m)", "door hinge (rad)"), strict=True):
+def starts_figure(table: pd.DataFrame, measures: Mapping[str, Progress]) -> Picture:
+    """How far along `horizon_analysis.starts` are, a panel each of `measures` (columns of the table); a dot a seed, a line for the mean."""
+    _columns(table, "start_fraction", *measures)
+    figure, axes = blank(1, len(measures), (4.3 * len(measures), 3.2))
+    for ax, (column, progress) in zip(axes[0], measures.items(), strict=True):
         ax.plot(1 - table.start_fraction, table[column], "o", ms=4, color=COLORS["exploring"], mew=0)
         mean = table.groupby("start_fraction")[column].mean()
         ax.plot(1 - mean.index, mean, "-", color=COLORS["decorated"])
         _horizons(ax, table.start_fraction)
-        ax.set_ylabel(label)
-    axes[0, 1].axhline(1.35, color=COLORS["gained"], ls="--", lw=1.2)
-    axes[0, 1].annotate("solved", (0.03, 1.35), (0, -11), textcoords="offset points", color=COLORS["gained"], fontsize=8.5)
+        ax.set_ylabel(progress.label)
+        if progress.solved is not None:
+            ax.axhline(progress.solved, color=COLORS["gained"], ls="--", lw=1.2)
+            ax.annotate("solved", (0.03, progress.solved), (0, -11), textcoords="offset points", color=COLORS["gained"], fontsize=8.5)
     return figure
 
 

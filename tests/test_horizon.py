@@ -78,6 +78,14 @@ def test_steps_and_limits():
     assert horizon_spec(PICKY, 0.5, ways).max_episode_steps == 10
 
 
+def test_starts_tell_how_far_each_task_has_come():
+    """At nine tenths of the scripted expert's way the red cube is nearly where it belongs; no task without measures is begun."""
+    early, late = (analysis.starts(get_task("StackCube"), fraction, [1_000_000]).iloc[0] for fraction in (0.0, 0.9))
+    assert early.reach > 0.05 > late.reach and early.apart > 0.05 > late.apart and late.left < early.left
+    with pytest.raises(PdkitError, match="Unknown task with starts on the way 'Pen'; choose one of: Door, StackCube"):
+        analysis.starts(get_task("Pen"), 0.0, [0])
+
+
 @pytest.mark.parametrize(("fraction", "x"), [(0.25, 0.25), (0.5, 0.5), (0.75, 0.75)])
 def test_an_episode_starts_on_the_way_and_needs_the_rest_of_it(fraction, x):
     sim = horizon_spec(PICKY, fraction, ways).make()
@@ -294,7 +302,8 @@ def test_figures_draw_what_they_are_given():
     assert [list(x.get_ydata()) for x in right.lines[:2]] == [[20.0], [900]]
     starts = pd.DataFrame({"start_fraction": [0.0, 0.5], "hinge": [0, 0.2], "reach": [0.4, 0.1]})
     corridor = pd.DataFrame({"length": [5, 10], "n_step": 1, "updates": [10, None]})
-    for picture in (plots_horizon.starts_figure(starts), plots_horizon.propagation_figure(corridor)):
+    door = analysis.PROGRESS["Door"]
+    for picture in (plots_horizon.starts_figure(starts, door), plots_horizon.propagation_figure(corridor)):
         assert picture.png()[:4] == b"\x89PNG"
     with pytest.raises(PdkitError, match="first_reward"):
         plots_horizon.sweep_figure(done.drop(columns="first_reward_step"), "first_reward_step", labels)

@@ -173,6 +173,11 @@ def test_task_horizon(tmp_path):
     assert (tmp_path / "exploration.png").exists() and not (tmp_path / "starts.png").exists()
 
 
+def test_task_horizon_of_the_cube(tmp_path):
+    result = run("10", tmp_path, task="StackCube", episodes=2, n_steps="[5]")
+    assert result["task"] == "StackCube" and result["starts"]["0.9"]["apart"] < 0.05 < result["starts"]["0"]["apart"]
+
+
 def test_residual_rl_and_fish(tmp_path):
     result = run("11", tmp_path, alpha=0.05, ks="[2]")
     assert result["stray"]["decorator"] < result["stray"]["bound alone"] < result["stray"]["residual RL"]
