@@ -45,18 +45,24 @@ FAMILIES = {  # how the methods are told apart in a figure: by what learns
 }
 STARTS = {"base": "the base policy", "bet-sac": "its twin for fine-tuning", "vinn": "nearest neighbours (VINN)",
           "diffusion": "a Diffusion Policy"}
+BETS = {"StackCube": "bet-sac"}  # by task, where the main job's base policy is no Behavior Transformer: the one that comparisons decorate
 LEAST_RATIO = 0.01  # of smoothness: recorded numbers are rounded, and a policy that stands still has none of it
 
 
 # ---- recorded rows ---------------------------------------------------------------------------------------------------
 
-def available(name: str) -> tuple[pd.DataFrame, pd.DataFrame]:
+def available(name: str, task: str | None = None) -> tuple[pd.DataFrame, pd.DataFrame]:
     """`recorded.load`, but where nothing is recorded two empty tables, and a printed sentence that tells which sweep makes them."""
     try:
-        return load(name)
+        return load(name, task)
     except PdkitError as error:
         print(error)
         return pd.DataFrame(columns=["task", "recipe", "seed"]), pd.DataFrame(columns=["task", "recipe", "seed", "step"])
+
+
+def record_of(name: str, task: str) -> str:
+    """What the results of a comparison that Door's sweep `name` makes are called on a task: those of another have a sweep of their own."""
+    return name if task == "Door" else f"{name}_{task.lower()}"
 
 
 def method_of(recipe: str) -> str:
@@ -191,16 +197,23 @@ def budgets(table: pd.DataFrame, labels: Mapping[str, str]) -> pd.DataFrame:
 
 # ---- a run of the reader's own ---------------------------------------------------------------------------------------
 
+def start_of(method: str, task: str) -> Path:
+    """Where the policy lies that the comparisons start a method from: on every task a Behavior Transformer for those that decorate the
+    base policy. Raises PdkitError for an unknown method, and where the kit has no such policy."""
+    folder = base_folder(method, task)
+    return folder.with_name(BETS.get(task, "base")) if folder.name == "base" else folder
+
+
 def own_run(method: str, task: str, profile: str, seed: int, folder: Path, episodes: int, recipe: str = "", base: Path | None = None,
             **changes: Any) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Train one method once, below `folder`, and return its row and its curve in the form of recorded ones, as `recipe` (the method).
-    It starts from the policy in `base`, or from the shipped one that the method starts from. Two columns more than a recorded row has:
+    It starts from the policy in `base`, or from that of `start_of`. Two columns more than a recorded row has:
     start and folder, where the policy lies that it started from, and the run (see `before_and_after`).
 
     A finished run with the same settings is read, an interrupted one goes on. Raises PdkitError for an unknown method or setting, and
     where the policy is missing that the method starts from.
     """
-    start = base or base_folder(method, task)
+    start = base or start_of(method, task)
     card, policy = read_card(start), load_policy(start)
     config = method_config(method, task, profile, seed, policy=policy, **changes)
     needed = config.demo_fraction or trainer_of(method).needs_demos

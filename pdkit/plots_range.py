@@ -1,4 +1,4 @@
-"""The figure of all tasks (notebook 16): from base to decorated policy, beside the paper's averages."""
+"""Figures of all tasks: from base to decorated policy, beside the paper's averages (notebook 16), and what a bound allows (notebook 13)."""
 from __future__ import annotations
 
 import matplotlib as mpl
@@ -46,6 +46,39 @@ def range_figure(tasks: pd.DataFrame, averages: pd.DataFrame, title: str = "") -
              ("s", "none", "0.3", "the paper's mean, four tasks")]
     handles = [Line2D([], [], marker=m, ls="", mfc=fill, color=edge, label=label) for m, fill, edge, label in marks]
     figure.legend(handles=handles, loc="outside lower center", ncols=3, fontsize=8.5)
+    return figure
+
+
+@styled
+def bounds_figure(table: pd.DataFrame, reached: pd.DataFrame | None = None, title: str = "") -> Picture:
+    """A panel a task: success of a base policy that a demonstrator corrects, by the bound (rows of `oracle.by_bound`), with its intervals.
+
+    `reached` has task, alpha and success of decorated policies: a diamond at the bound that they were trained with.
+    """
+    _columns(table, "task", "alpha", "success", "low", "high")
+    tasks = list(dict.fromkeys(table.task))
+    figure, axes = blank(-(-len(tasks) // 4), min(4, len(tasks)), size=(2.5 * min(4, len(tasks)) + 0.4, 2.2 * -(-len(tasks) // 4) + 0.7))
+    least = table.alpha[table.alpha > 0].min()
+    for ax, task in zip(axes.flat, tasks, strict=False):
+        rows = table[table.task == task].sort_values("alpha")
+        ax.fill_between(rows.alpha, rows.low, rows.high, color=COLORS["base"], alpha=0.2, lw=0)
+        ax.plot(rows.alpha, rows.success, "-o", ms=4, color=COLORS["base"])
+        for row in reached[reached.task == task].itertuples() if reached is not None else ():
+            ax.plot(row.alpha, row.success, "D", ms=6, color=COLORS["decorated"])
+        ax.set_xscale("symlog", linthresh=least)  # 0, the base policy alone, stands on it too
+        ticks = sorted(set(table.alpha))
+        ax.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
+        ax.xaxis.set_minor_locator(mpl.ticker.NullLocator())
+        ax.set(title=task, ylim=(0, 1.04), xlim=(-least / 4, max(ticks) * 1.3))
+        ax.yaxis.set_major_formatter(mpl.ticker.PercentFormatter(1.0, decimals=0))
+    for ax in axes.flat[len(tasks):]:
+        ax.set_visible(False)
+    figure.supxlabel("bound of the correction, alpha", fontsize=9.5)
+    figure.supylabel("success within the episode", fontsize=9.5)
+    figure.suptitle(title)
+    marks = [("o", COLORS["base"], "base, corrected by a demonstrator"), ("D", COLORS["decorated"], "decorated, at its own bound")]
+    handles = [Line2D([], [], marker=m, ls="", color=color, label=label) for m, color, label in marks[: 1 + (reached is not None)]]
+    figure.legend(handles=handles, loc="outside lower center", ncols=2, fontsize=8.5)
     return figure
 
 

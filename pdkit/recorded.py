@@ -51,11 +51,12 @@ def load(name: str, task: str | None = None) -> tuple[pd.DataFrame, pd.DataFrame
     Raises PdkitError when nothing is recorded.
     """
     path, curves = DATA / "results" / f"{name}.csv", DATA / "results" / f"{name}_curves.csv"
-    table = pd.read_csv(path) if path.exists() else pd.DataFrame(columns=KEYS)
-    table = table if task is None else table[table.task == task]
+    every = pd.read_csv(path) if path.exists() else pd.DataFrame(columns=KEYS)
+    table = every if task is None else every[every.task == task]
     if table.empty:
-        raise PdkitError(f"No results {name!r}{f' of {task}' if task else ''} are recorded in data/results; "
-                         f"`pdkit sweep data/sweeps/{name}.toml` makes them.")
+        known = ", ".join(dict.fromkeys(every.task))
+        others = f", only of {known}." if known else f"; `pdkit sweep data/sweeps/{name}.toml` makes them."
+        raise PdkitError(f"No results {name!r}{f' of {task}' if task else ''} are recorded in data/results{others}")
     lines = pd.read_csv(curves) if curves.exists() else pd.DataFrame(columns=[*KEYS, "step"])
     return table.reset_index(drop=True), lines[lines.task.isin(table.task)].reset_index(drop=True)
 

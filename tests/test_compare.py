@@ -6,11 +6,12 @@ import pandas as pd
 import pytest
 from matplotlib.colors import to_hex
 
-from pdkit import ablations, compare, plots_compare, recorded
+from pdkit import ablations, claims, compare, plots_compare, recorded
 from pdkit.claims import TooLittle
 from pdkit.errors import PdkitError
 from pdkit.files import DATA
 from pdkit.methods import METHODS
+from pdkit.policies import load_policy
 from pdkit.seeds import reported_seeds
 from pdkit.sweep import load_spec
 
@@ -183,6 +184,13 @@ def test_a_bound_works_where_it_helps_and_hardly_any_is_better(near, best, base,
 
 
 # ---- a run of one's own ----------------------------------------------------------------------------------------------
+
+def test_comparisons_start_from_a_behavior_transformer():
+    folders = {(method, task): compare.start_of(method, task).relative_to(DATA / "checkpoints").as_posix() for method, task in (
+        ("policy_decorator", "Door"), ("policy_decorator", "StackCube"), ("sac_finetune", "StackCube"), ("fish", "Door"))}
+    assert list(folders.values()) == ["Door/base", "StackCube/bet-sac", "StackCube/bet-sac", "Door/vinn"]
+    assert all(load_policy(DATA / "checkpoints" / f).kind in (*claims.BETS, "vinn") for f in folders.values())
+
 
 def test_an_own_run_is_a_recorded_row_and_is_made_once(tmp_path, monkeypatch):
     monkeypatch.setenv("PDKIT_RUNS", str(tmp_path / "runs"))

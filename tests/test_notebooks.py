@@ -195,6 +195,12 @@ def test_ablations(tmp_path):
     assert (tmp_path / "grid_curves.png").exists() and result["exercise_solved"] is False
 
 
+def test_ablations_of_the_cube(tmp_path):
+    result = run("13", tmp_path, task="StackCube", episodes=1)
+    assert result["task"] == "StackCube" and result["recipe"] == "alpha=1.0,H=0" and result["env_steps"] >= 600
+    assert result["base_success"] in (0.0, 1.0) and 0 < result["scales"]["mean |a_t - a_(t-1)|"] < result["scales"]["mean |a|"]
+
+
 def test_pixels_where_nothing_can_be_drawn(tmp_path):
     """What is recorded, and who is lost when blindfolded, needs no renderer (tests/test_pixels.py draws)."""
     result = run("15", tmp_path)
