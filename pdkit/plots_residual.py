@@ -15,7 +15,7 @@ from .stats import Rate
 
 @styled
 def first_episodes_figure(strays: Mapping[str, np.ndarray], rates: Mapping[str, Rate], title: str = "") -> Picture:
-    """Left: distance of the palm from where the base policy alone has it, by step: the mean over episodes, and the middle half of them.
+    """Left: distance of the hand from where the base policy alone has it, by step: the mean over episodes, and the middle half of them.
     Right: success with 95 % Wilson intervals, for the base policy too (the first of `rates`, grey).
 
     `strays` are `residual_analysis.stray` arrays (episodes, steps + 1) by the names that `rates` have.
@@ -26,7 +26,7 @@ def first_episodes_figure(strays: Mapping[str, np.ndarray], rates: Mapping[str, 
         step, (low, high) = np.arange(apart.shape[1]), np.quantile(100 * apart, [0.25, 0.75], axis=0)
         left.plot(step, 100 * apart.mean(axis=0), color=PALETTE[i], label=name)
         left.fill_between(step, low, high, color=PALETTE[i], alpha=0.15, lw=0)
-    left.set(xlabel="step of the episode", ylabel="palm, from the base policy's place (cm)", ylim=(0, None))
+    left.set(xlabel="step of the episode", ylabel="hand, from the base policy's place (cm)", ylim=(0, None))
     left.legend(fontsize=8.5)
     for y, (name, rate) in enumerate(reversed(rates.items())):
         color = PALETTE[list(strays).index(name)] if name in strays else COLORS["base"]

@@ -1,6 +1,6 @@
 """Why residual RL and FISH fail, or do not: the measurements of notebook 11 (appendix G).
 
-    stray       distance of the palm from where the base policy alone has it, at the same step from the same seed (m)
+    stray       distance of the hand from where the base policy alone has it, at the same step from the same seed (m)
     late ratio  mean |residual| / mean |base action| over the last quarter of a run, as executed
     lookup      success of nearest neighbours by features, k and exclusion buffer (Tables 11 to 13, which are blank in the paper)
     transport   what FISH's reward gives a whole episode, and whether it tells solved episodes from failed ones
@@ -18,7 +18,7 @@ import pandas as pd
 
 from .decorator import DecoratorConfig, compose, gate
 from .demos.format import Demos, from_episodes
-from .errors import PdkitError
+from .errors import PdkitError, unknown
 from .policies import Policy
 from .rl.ot import OTReward
 from .stats import Paired, Rate, probability_of_improvement
@@ -26,7 +26,7 @@ from .tasks.lanes import IDLE
 from .tasks.spec import TaskSpec
 from .tasks.vector import VectorEnv
 
-PALM = slice(29, 32)  # Door's observation: position of the palm in m
+HANDS = {"Door": slice(29, 32), "StackCube": slice(25, 28)}  # where observations have the position of palm or gripper, in m
 FEATURES = ("raw", "GPT", "FiLM")  # what VINN can look up by here; images (Table 13) are left out: its demonstrations are states
 
 
@@ -95,15 +95,17 @@ def outcomes(episodes: Sequence[Trace]) -> pd.DataFrame:
     return pd.DataFrame([{"seed": t.seed, "success_once": t.solved, "length": len(t.success)} for t in episodes])
 
 
-def stray(reference: Sequence[Trace], others: Sequence[Trace]) -> np.ndarray:
-    """Distance in m between the palms of two policies, (episodes, steps + 1), cut at the shortest episode.
+def stray(reference: Sequence[Trace], others: Sequence[Trace], task: str = "Door") -> np.ndarray:
+    """Distance in m between the hands of two policies, (episodes, steps + 1), cut at the shortest episode.
 
-    Raises PdkitError when they are not episodes from the same seeds.
+    Raises PdkitError when they are not episodes from the same seeds, and for a task that HANDS does not know.
     """
+    if task not in HANDS:
+        raise unknown("task with a hand to follow", task, HANDS)
     if [t.seed for t in reference] != [t.seed for t in others]:
         raise PdkitError("Two policies stray from each other only in episodes from the same seeds, in the same order.")
     length = min(len(t.observations) for t in (*reference, *others))
-    apart = [a.observations[:length, PALM] - b.observations[:length, PALM] for a, b in zip(reference, others, strict=True)]
+    apart = [(a.observations[:length] - b.observations[:length])[:, HANDS[task]] for a, b in zip(reference, others, strict=True)]
     return np.linalg.norm(np.stack(apart), axis=-1)
 
 

@@ -188,6 +188,13 @@ def test_residual_rl_and_fish(tmp_path):
     assert (tmp_path / "vinn.png").exists() and not (tmp_path / "episodes.png").exists()
 
 
+def test_residual_rl_and_fish_on_the_cube(tmp_path):
+    result = run("11", tmp_path, task="StackCube", ks="[5]", own_steps=0)
+    assert result["task"] == "StackCube" and result["demonstrations"] == 300 and result["recorded_runs"] > 0
+    assert result["stray"]["bound alone"] < result["stray"]["residual RL"]
+    assert set(result["vinn"]) == {f"{features},{row}" for features in ("raw", "GPT", "FiLM") for row in ("k=5", "k=1,exclusion=3")}
+
+
 def test_ablations(tmp_path):
     result = run("13", tmp_path, alpha=0.3, critic_input="concat")
     assert result["recipe"] == "alpha=0.3,H=0,critic_input=concat" and result["env_steps"] >= 600 and result["episodes"] == 2

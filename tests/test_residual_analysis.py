@@ -72,7 +72,7 @@ def test_traces_are_whole_episodes_in_the_order_of_their_seeds(lanes):
 
 def trace(seed, palms, solved=False):
     observations = np.zeros((len(palms), 39), np.float32)
-    observations[:, analysis.PALM] = palms
+    observations[:, analysis.HANDS["Door"]] = palms
     return analysis.Trace(seed, observations, np.array([False] * (len(palms) - 2) + [solved]))
 
 
@@ -87,7 +87,11 @@ def test_stray_is_the_distance_of_the_palms_at_the_same_step():
 def test_the_palm_is_where_it_is_said_to_be():
     """Door's observation says palm, handle and their difference: the slice must be the first of the three."""
     observations = sources.bundled("Door").observations
-    np.testing.assert_allclose(observations[:, analysis.PALM] - observations[:, 32:35], observations[:, 35:38], atol=1e-5)
+    np.testing.assert_allclose(observations[:, analysis.HANDS["Door"]] - observations[:, 32:35], observations[:, 35:38], atol=1e-5)
+    cubes = sources.bundled("StackCube").observations  # red cube, and red cube minus gripper
+    np.testing.assert_allclose(cubes[:, 32:35] - cubes[:, analysis.HANDS["StackCube"]], cubes[:, 46:49], atol=1e-5)
+    with pytest.raises(PdkitError, match="Unknown task with a hand to follow 'Pen'"):
+        analysis.stray([], [], "Pen")
 
 
 def paired(before, after, n=20):

@@ -198,7 +198,7 @@ def test_bad_configurations_are_told(tmp_path):
     with pytest.raises(PdkitError, match="no demonstrations"):
         act(VINN({"obs_dim": 1, "act_dim": 1}), 0.0)
     save_policy(MLP({"obs_dim": 1, "act_dim": 1, "hidden": 4}), tmp_path / "mlp")
-    with pytest.raises(PdkitError, match="kind bet or diffusion, not mlp"):
+    with pytest.raises(PdkitError, match="kind bet or bet-sac or diffusion, not mlp"):
         lookup(representation=str(tmp_path / "mlp"))
     with pytest.raises(PdkitError, match="nowhere"):
         lookup(representation=str(tmp_path / "nowhere"))

@@ -23,9 +23,10 @@ from torch import nn
 from ..errors import PdkitError
 from .base import Normalizer, Policy, load_policy
 from .bet import BeT
+from .bet_sac import BeTForSAC
 from .diffusion import DiffusionPolicy
 
-LENDERS: dict[str, type[Policy]] = {cls.kind: cls for cls in (BeT, DiffusionPolicy)}  # whose features can be used
+LENDERS: dict[str, type[Policy]] = {cls.kind: cls for cls in (BeT, BeTForSAC, DiffusionPolicy)}  # whose features can be used
 
 
 class VINN(Policy):
