@@ -16,11 +16,11 @@ import pandas as pd
 import torch
 
 from . import unlearning
-from .compare import available
+from .compare import available, start_of
 from .decorator import critic_features
 from .demos import sources
 from .errors import PdkitError
-from .methods.registry import base_folder, make_trainer, method_config
+from .methods.registry import make_trainer, method_config
 from .online import Trainer
 from .online_rows import demo_rows
 from .policies import load_policy
@@ -64,7 +64,7 @@ def method_of(letter: str) -> str:
 def trainer_of_setup(letter: str, task: str = "Door", profile: str = "lesson", seed: int = 0, **changes: Any) -> Trainer:
     """The trainer of a setup on the shipped policy and demonstrations, before any update. Raises PdkitError for an unknown letter."""
     method = method_of(letter)
-    start = base_folder(method, task)
+    start = start_of(method, task)
     demos = sources.bundled(task).first(read_card(start)["info"]["demos"])
     return make_trainer(method_config(method, task, profile, seed, **changes), load_policy(start), demos)
 
