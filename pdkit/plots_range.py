@@ -58,7 +58,7 @@ def bounds_figure(table: pd.DataFrame, reached: pd.DataFrame | None = None, titl
     _columns(table, "task", "alpha", "success", "low", "high")
     tasks = list(dict.fromkeys(table.task))
     figure, axes = blank(-(-len(tasks) // 4), min(4, len(tasks)), size=(2.5 * min(4, len(tasks)) + 0.4, 2.2 * -(-len(tasks) // 4) + 0.7))
-    least = table.alpha[table.alpha > 0].min()
+    least, most = table.alpha[table.alpha > 0].min(), max(table.alpha.max(), reached.alpha.max() if reached is not None else 0)
     for ax, task in zip(axes.flat, tasks, strict=False):
         rows = table[table.task == task].sort_values("alpha")
         ax.fill_between(rows.alpha, rows.low, rows.high, color=COLORS["base"], alpha=0.2, lw=0)
@@ -69,11 +69,12 @@ def bounds_figure(table: pd.DataFrame, reached: pd.DataFrame | None = None, titl
         ticks = sorted(set(table.alpha))
         ax.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
         ax.xaxis.set_minor_locator(mpl.ticker.NullLocator())
-        ax.set(title=task, ylim=(0, 1.04), xlim=(-least / 4, max(ticks) * 1.3))
+        ax.set(title=task, ylim=(0, 1.04), xlim=(-least / 4, most * 1.3))
         ax.yaxis.set_major_formatter(mpl.ticker.PercentFormatter(1.0, decimals=0))
     for ax in axes.flat[len(tasks):]:
         ax.set_visible(False)
-    figure.supxlabel("bound of the correction, alpha", fontsize=9.5)
+    for ax in axes.flat[max(0, len(tasks) - axes.shape[1]):len(tasks)]:
+        ax.set_xlabel("alpha")
     figure.supylabel("success within the episode", fontsize=9.5)
     figure.suptitle(title)
     marks = [("o", COLORS["base"], "base, corrected by a demonstrator"), ("D", COLORS["decorated"], "decorated, at its own bound")]

@@ -62,3 +62,14 @@ def test_what_is_recorded_over_a_diffusion_policy(results):
     (row,) = task_range.over_diffusion().to_dict("records")
     assert (row["task"], row["suite"], row["policy"], row["seeds"], row["demos"]) == ("StackCube", "maniskill", "diffusion", 1, 300)
     assert row["base"] == pytest.approx(0.7) and row["decorated"] == pytest.approx(0.6) and row["at_end"] == pytest.approx(0.1)
+
+
+def test_the_figure_of_bounds_has_a_panel_a_task_and_a_diamond_where_something_was_learned():
+    table = pd.DataFrame([dict(task=task, alpha=alpha, success=alpha, low=0.0, high=1.0)
+                          for task in ("Door", "Pen") for alpha in (0, 0.1, 0.3)])
+    figure = plots_range.bounds_figure(table, pd.DataFrame([dict(task="Pen", alpha=0.4, success=0.7)]))
+    door, pen = figure.axes
+    assert [ax.get_title(loc="left") or ax.get_title() for ax in (door, pen)] == ["Door", "Pen"] and len(door.lines) == 1
+    diamond = pen.lines[1]
+    assert (diamond.get_marker(), *map(float, (*diamond.get_xdata(), *diamond.get_ydata()))) == ("D", 0.4, 0.7) and pen.get_xlim()[1] > 0.4
+    assert len(plots_range.bounds_figure(table).legends[0].get_texts()) == 1
