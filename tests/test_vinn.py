@@ -43,6 +43,19 @@ def test_more_neighbours_are_weighted_by_the_softmax_of_minus_their_distances():
     assert act(lookup(k=3), 0.5) == pytest.approx([weights @ [0.0, 0.5, -1.0] / weights.sum()])
 
 
+def test_a_large_library_is_looked_up_as_exactly_as_by_measuring_all_of_it():
+    """Rows 1e-3 apart, far from the origin: single-precision products would not tell them apart."""
+    torch.manual_seed(0)
+    policy = VINN({"obs_dim": 20, "act_dim": 1})
+    library = 30 + torch.cat([torch.randn(500, 20), torch.randn(1, 20) + 1e-3 * torch.randn(500, 20)])
+    policy.remember(library[:, None], torch.zeros(1000, 1))
+    asked = torch.cat([library[::7], library[::9] + 5e-4 * torch.randn(112, 20)])
+    distance, rows = policy._nearest(asked, 4)
+    expected = torch.cdist(asked, library, compute_mode="donot_use_mm_for_euclid_dist").topk(4, dim=1, largest=False)
+    assert torch.equal(distance, expected.values) and torch.equal(rows, expected.indices)
+    assert (distance[: len(library[::7]), 0] == 0).all()
+
+
 def test_distances_are_in_normalised_units():
     policy = VINN({"obs_dim": 2, "act_dim": 1, "k": 1})
     observations = np.array([[0, 0], [1, 300], [0, 100]], np.float32)
