@@ -52,7 +52,7 @@ PROGRESS: dict[str, dict[str, Progress]] = {  # by task and column of `starts`
     },
     "StackCube": {
         "reach": Progress("gripper to red cube (m)", lambda o: float(np.linalg.norm(o[46:49]))),
-        "apart": Progress("red cube to its place on the green one (m)", lambda o: float(np.linalg.norm(-o[52:55] - (0, 0, CUBE)))),
+        "apart": Progress("red cube to its place (m)", lambda o: float(np.linalg.norm(-o[52:55] - (0, 0, CUBE)))),
     },
 }
 
