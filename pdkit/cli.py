@@ -5,6 +5,7 @@ This module imports only the standard library, so that `pd --help` answers at on
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import os
 import sys
 from collections.abc import Callable
@@ -106,7 +107,8 @@ def test(argv: list[str]) -> int:
     import pytest
 
     os.chdir(ROOT)
-    alone = any(os.path.exists(a.split("::")[0]) for a in argv) or any(a == "--pdb" or a.startswith(("-n", "--numprocesses")) for a in argv)
+    serial = ("-n", "--numprocesses", "--pdb", "--trace", "-s", "--capture=no", "no:xdist")
+    alone = any(os.path.exists(a.split("::")[0]) or a.startswith(serial) for a in argv) or not importlib.util.find_spec("xdist")
     workers = min(4, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
     return int(pytest.main(argv if alone or workers < 2 else ["-n", str(workers), "--dist", "worksteal", *argv]))
 

@@ -43,16 +43,17 @@ FAMILIES = {  # how the methods are told apart in a figure: by what learns
     "PPO instead of SAC": ("ppo_decorator", "ppo_residual_rl", "ppo_finetune", "dppo"),
     SCRATCH: ("sac_from_scratch", "rlpd", "calql_a", "calql_b", "calql_c", "calql_d"),
 }
-STARTS = {"base": "the base policy", "bet-sac": "its twin for fine-tuning", "vinn": "nearest neighbours (VINN)",
+STARTS = {"base": "the base policy", "bet-sac": "a BeT for fine-tuning", "vinn": "nearest neighbours (VINN)",
           "diffusion": "a Diffusion Policy"}
-BETS = {"StackCube": "bet-sac"}  # by task, where the main job's base policy is no Behavior Transformer: the one that comparisons decorate
+DECORATED = {"StackCube": "bet-sac"}  # by task: the policy that comparisons decorate, where it is not the main job's; a BeT
 LEAST_RATIO = 0.01  # of smoothness: recorded numbers are rounded, and a policy that stands still has none of it
 
 
 # ---- recorded rows ---------------------------------------------------------------------------------------------------
 
 def available(name: str, task: str | None = None) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """`recorded.load`, but where nothing is recorded two empty tables, and a printed sentence that tells which sweep makes them."""
+    """`recorded.load`, but where nothing is recorded two empty tables, and its sentence printed: which sweep makes them, or of which
+    tasks they are."""
     try:
         return load(name, task)
     except PdkitError as error:
@@ -188,7 +189,7 @@ def budgets(table: pd.DataFrame, labels: Mapping[str, str]) -> pd.DataFrame:
         batch = m.ppo_rollout * config.num_envs // m.ppo_minibatches if on_policy else config.batch
         demos = f"{config.demo_fraction:.0%} of a batch" if config.demo_fraction else \
             "yes, not in batches" if trainer_of(method).needs_demos else "none"
-        start = "nothing" if from_scratch(recipe) else STARTS[METHODS[method].base]
+        start = "nothing" if from_scratch(recipe) else STARTS[start_of(method, task).name]
         rows.append({"method": label, "starts from": start, "demonstrations": demos,
                      "environment steps": f"{mine.env_steps.mean():,.0f}", "updates": f"{mine.updates.mean():,.0f}",
                      "transitions an update": f"{batch:,}", "minutes": f"{mine.train_minutes.mean():.1f}"})
@@ -198,10 +199,10 @@ def budgets(table: pd.DataFrame, labels: Mapping[str, str]) -> pd.DataFrame:
 # ---- a run of the reader's own ---------------------------------------------------------------------------------------
 
 def start_of(method: str, task: str) -> Path:
-    """Where the policy lies that the comparisons start a method from: on every task a Behavior Transformer for those that decorate the
-    base policy. Raises PdkitError for an unknown method, and where the kit has no such policy."""
+    """Where the policy lies that the comparisons start a method from: the one that comes with the kit, but for methods that decorate the
+    base policy that of DECORATED. Raises PdkitError for an unknown method, and where the kit has no such policy."""
     folder = base_folder(method, task)
-    return folder.with_name(BETS.get(task, "base")) if folder.name == "base" else folder
+    return folder.with_name(DECORATED.get(task, "base")) if folder.name == "base" and not from_scratch(method) else folder
 
 
 def own_run(method: str, task: str, profile: str, seed: int, folder: Path, episodes: int, recipe: str = "", base: Path | None = None,

@@ -66,8 +66,9 @@ def by_bound(spec: TaskSpec, base: Policy, alphas: Sequence[float], seeds: Seque
         raise PdkitError("An oracle corrects single actions; name a base policy that decides on one action at a time.")
     if (base.config["obs_dim"], base.config["act_dim"]) != (spec.obs_dim, spec.act_dim):
         raise PdkitError(f"This policy is for another robot or other observations than those of {spec.name}: name one of the task.")
-    if not len(alphas) or not all(0 <= alpha <= 1 for alpha in alphas):
-        raise PdkitError(f"A bound of the correction lies between 0 and 1; {', '.join(f'{a:g}' for a in alphas) or 'nothing'} does not.")
+    if not len(alphas) or any(not 0 <= alpha <= 1 for alpha in alphas):
+        wrong = ", ".join(f"{alpha:g}" for alpha in alphas if not 0 <= alpha <= 1) or "nothing"
+        raise PdkitError(f"A bound of the correction lies between 0 and 1; {wrong} does not.")
     rows, sim = [], spec.make()
     try:
         guide = demonstrator(spec.name, sim)

@@ -58,7 +58,8 @@ def bounds_figure(table: pd.DataFrame, reached: pd.DataFrame | None = None, titl
     _columns(table, "task", "alpha", "success", "low", "high")
     tasks = list(dict.fromkeys(table.task))
     figure, axes = blank(-(-len(tasks) // 4), min(4, len(tasks)), size=(2.5 * min(4, len(tasks)) + 0.4, 2.2 * -(-len(tasks) // 4) + 0.7))
-    least, most = table.alpha[table.alpha > 0].min(), max(table.alpha.max(), reached.alpha.max() if reached is not None else 0)
+    least = table.alpha[table.alpha > 0].min() if table.alpha.any() else 0.1
+    most = max(table.alpha.max(), reached.alpha.max() if reached is not None else 0)
     for ax, task in zip(axes.flat, tasks, strict=False):
         rows = table[table.task == task].sort_values("alpha")
         ax.fill_between(rows.alpha, rows.low, rows.high, color=COLORS["base"], alpha=0.2, lw=0)

@@ -95,7 +95,7 @@ def outcomes(episodes: Sequence[Trace]) -> pd.DataFrame:
     return pd.DataFrame([{"seed": t.seed, "success_once": t.solved, "length": len(t.success)} for t in episodes])
 
 
-def stray(reference: Sequence[Trace], others: Sequence[Trace], task: str = "Door") -> np.ndarray:
+def stray(reference: Sequence[Trace], others: Sequence[Trace], task: str) -> np.ndarray:
     """Distance in m between the hands of two policies, (episodes, steps + 1), cut at the shortest episode.
 
     Raises PdkitError when they are not episodes from the same seeds, and for a task that HANDS does not know.

@@ -2,7 +2,8 @@
 
 The paper gives averages over tasks only; what it has for a single task is not known, and none is invented here. The recorded runs are
 those of the main job (data/results/main_job.csv): the decorator's best evaluation on selection episodes, tested on others. Where the main
-job's own base is no BeT, as the paper's are, but one was decorated by the same recipe (bet_bases.csv), those runs stand for the task.
+job's own base is no BeT, as the paper's are, but one was decorated by the same recipe (bet_bases.csv, evaluated otherwise while it
+learns), those runs stand for the task.
 """
 from __future__ import annotations
 
@@ -33,8 +34,11 @@ ENOUGH = 3  # seeds below which the interval is the test episodes' alone
 
 
 def over_bets(jobs: pd.DataFrame, bets: pd.DataFrame) -> pd.DataFrame:
-    """Rows of main_job.csv, but on the tasks of bet_bases.csv that one's."""
-    return pd.concat([jobs[~jobs.task.isin(bets.task)], bets], ignore_index=True) if len(bets) else jobs
+    """Rows of main_job.csv, but on the tasks of which bet_bases.csv has ENOUGH seeds that one's."""
+    if not len(bets):
+        return jobs
+    known = bets[bets.groupby("task").seed.transform("nunique") >= ENOUGH]
+    return pd.concat([jobs[~jobs.task.isin(known.task)], known], ignore_index=True)
 
 
 def by_task(table: pd.DataFrame) -> pd.DataFrame:

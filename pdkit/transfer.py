@@ -93,7 +93,8 @@ def corrected(kind: str, policy: Policy | Decorated, args: argparse.Namespace) -
         if args.record:
             again = [f"pdkit evaluate {args.policy} --tasks {task} --episodes {args.episodes} --oracle {alpha:g} --record {args.record}"
                      for alpha in rows.alpha]
-            record(args.record, rows.assign(recipe=[f"alpha={alpha:g}" for alpha in rows.alpha], seed=0, command=again), pd.DataFrame())
+            named = [f"{policy.kind},alpha={alpha:g}" for alpha in rows.alpha]
+            record(args.record, rows.assign(policy=policy.kind, recipe=named, seed=0, command=again), pd.DataFrame())
     return 0
 
 
@@ -106,7 +107,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--film", metavar="FILE", help="write an episode as FILE (.mp4 or .webp) instead, of a decorated policy one that "
                                                        "its base does not solve, side by side")
     parser.add_argument("--oracle", nargs="+", type=float, metavar="ALPHA", help="success of a base policy that a demonstrator corrects by "
-                        "at most so much (0: not at all), instead: what a bound allows")
+                        "at most so much (0: not at all; times the task's alpha_scale), instead: what a bound allows")
     parser.add_argument("--threads", type=int, default=1)
     args = parser.parse_args(argv)
     if args.film and (args.oracle or args.record):

@@ -83,6 +83,7 @@ SHARED = ["--dist", "worksteal"]
 @pytest.mark.parametrize("cores, argv, before", [
     (2, ["--slow"], ["-n", "2", *SHARED]), (64, [], ["-n", "4", *SHARED]), (2, ["-k", "sac"], ["-n", "2", *SHARED]),
     (1, [], []), (2, ["tests/test_cli.py::test_lab"], []), (2, ["-n", "0"], []), (2, ["--pdb"], []),
+    (2, ["-s"], []), (2, ["-p", "no:xdist"], []),
 ])
 def test_all_tests_share_the_cores_and_those_of_a_path_do_not(monkeypatch, cores, argv, before):
     called = []
@@ -92,6 +93,16 @@ def test_all_tests_share_the_cores_and_those_of_a_path_do_not(monkeypatch, cores
     for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
         monkeypatch.setenv(name, "1")  # put back afterwards
     assert cli.test(argv) == 0 and called == [*before, *argv]
+
+
+def test_without_the_package_that_shares_them_tests_run_one_after_the_other(monkeypatch):
+    called = []
+    monkeypatch.setattr(pytest, "main", lambda argv: called.extend(argv) or 0)
+    monkeypatch.setattr(cli.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.chdir(cli.ROOT)
+    for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+        monkeypatch.setenv(name, "1")
+    assert cli.test(["--slow"]) == 0 and called == ["--slow"]
 
 
 def test_lab_opens_the_notebooks_folder(monkeypatch, tmp_path):

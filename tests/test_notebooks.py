@@ -169,6 +169,8 @@ def test_calql(tmp_path):
 def test_what_becomes_of_fine_tuning_on_the_cube(tmp_path, name, parameters):
     result = run(name, tmp_path, task="StackCube", **parameters)
     assert result["task"] == "StackCube" and result.get("recorded_runs", 0) == 0
+    if name == "07":  # the target entropy is the paper's, not that of the lesson recipe, which lets no temperature rise
+        assert result["runs"]["warm"]["temperature"] > 1
     if name == "09":
         data = {row["source"]: row for row in result["data"]}
         assert data["demonstrations"]["episodes"] == 300 and data["rollouts"]["episodes"] == 4
@@ -214,7 +216,7 @@ def test_ablations(tmp_path):
 def test_ablations_of_the_cube(tmp_path):
     result = run("13", tmp_path, task="StackCube", episodes=1)
     assert result["task"] == "StackCube" and result["recipe"] == "alpha=1.0,H=0" and result["env_steps"] >= 600
-    assert result["base_success"] in (0.0, 1.0) and 0 < result["scales"]["mean |a_t - a_(t-1)|"] < result["scales"]["mean |a|"]
+    assert result["policy"] == "bet-sac" and 0 < result["scales"]["mean |a_t - a_(t-1)|"] < result["scales"]["mean |a|"]
 
 
 def test_pixels_where_nothing_can_be_drawn(tmp_path):

@@ -71,7 +71,7 @@ def test_what_cannot_be_corrected_is_refused(straight):
         oracle.by_bound(REACH, TwoAtOnce(plain), [0.1], [0])
     with pytest.raises(PdkitError, match="name one of the task"):
         oracle.by_bound(get_task("Door"), ProbeBase(plain), [0.1], [0])
-    for alphas, said in (([0.1, 1.5], "0.1, 1.5 does not"), ([], "nothing does not")):
+    for alphas, said in (([0.1, 1.5], "and 1; 1.5 does not"), ([], "nothing does not")):
         with pytest.raises(PdkitError, match=said):
             oracle.by_bound(REACH, ProbeBase(plain), alphas, [0])
 
@@ -83,7 +83,7 @@ def test_the_command_prints_and_records_a_row_a_bound(straight, results, tmp_pat
     assert cli.main([*words, "--oracle", "0", "1", "--record", "oracle"]) == 0
     assert "corrected by at most 1: 100" in capsys.readouterr().out
     table = pd.read_csv(results / "oracle.csv")
-    assert table.recipe.tolist() == ["alpha=0", "alpha=1"] and table.episodes.tolist() == [4, 4] and table.success[1] == 1.0
+    assert table.recipe.tolist() == ["mlp,alpha=0", "mlp,alpha=1"] and table.episodes.tolist() == [4, 4] and table.success[1] == 1.0
     assert table.command[1] == f"pdkit {' '.join(words)} --oracle 1 --record oracle"
     assert cli.main([*words, "--oracle", "0.1", "--film", "x.webp"]) == 2 and "leave --oracle" in capsys.readouterr().err
     assert cli.main(["evaluate", str(DATA / "checkpoints/Door/decorated"), "--tasks", "Door", "--oracle", "0.1"]) == 2

@@ -79,9 +79,9 @@ def trace(seed, palms, solved=False):
 def test_stray_is_the_distance_of_the_palms_at_the_same_step():
     base = [trace(1, [[0, 0, 0]] * 3), trace(2, [[1, 1, 1]] * 4)]
     other = [trace(1, [[0, 0, 0], [3, 4, 0], [0, 0, 2]]), trace(2, [[1, 1, 1], [1, 1, 2], [1, 1, 1], [9, 9, 9]])]
-    np.testing.assert_allclose(analysis.stray(base, other), [[0, 5, 2], [0, 1, 0]])
+    np.testing.assert_allclose(analysis.stray(base, other, "Door"), [[0, 5, 2], [0, 1, 0]])
     with pytest.raises(PdkitError, match="same seeds"):
-        analysis.stray(base, other[::-1])
+        analysis.stray(base, other[::-1], "Door")
 
 
 def test_the_palm_is_where_it_is_said_to_be():

@@ -30,9 +30,10 @@ def test_every_task_of_the_paper_has_a_row(tasks):
 
 def test_a_decorated_bet_stands_for_a_task_whose_main_job_has_another_base():
     jobs = pd.DataFrame([dict(task=task, policy="mlp", seed=seed) for task in ("Pen", "StackCube") for seed in range(3)])
-    bets = pd.DataFrame([dict(task="StackCube", policy="bet-sac", seed=0)])
+    bets = pd.DataFrame([dict(task="StackCube", policy="bet-sac", seed=seed) for seed in range(3)])
     shown = task_range.over_bets(jobs, bets)
-    assert shown.task.tolist() == ["Pen"] * 3 + ["StackCube"] and shown.policy.tolist() == ["mlp"] * 3 + ["bet-sac"]
+    assert shown.task.tolist() == ["Pen"] * 3 + ["StackCube"] * 3 and shown.policy.tolist() == ["mlp"] * 3 + ["bet-sac"] * 3
+    assert task_range.over_bets(jobs, bets[:2]).policy.tolist() == ["mlp"] * 6  # two seeds are too few to replace three
     assert task_range.over_bets(jobs, pd.DataFrame()) is jobs
 
 

@@ -49,9 +49,10 @@ from .registry import EIGHT, measures
 # ---- the comparison of methods (leaderboard) --------------------------------------------------------------------------
 
 def _on_bet(kind: str = "") -> pd.DataFrame:
-    """The leaderboard on those tasks (of one kind: adroit, maniskill) where the decorator's own base policy is a BeT."""
+    """The leaderboard on those tasks (of one kind: adroit, maniskill) where the decorator's own base policy is a BeT in all runs."""
     table, _ = recorded("leaderboard")
-    bets = set(table.task[(table.recipe == DECORATOR) & table.policy.isin(BETS)])
+    own = table[table.recipe == DECORATOR]
+    bets = set(own.task) - set(own.task[~own.policy.isin(BETS)])
     return table[table.task.isin(bets & set(TASKS[kind] if kind else EIGHT))]
 
 
