@@ -4,7 +4,7 @@
     contents     the offline data, made here: demonstrations, and for A rollouts of the base policy with their failures
     losses       one offline stage with three losses: temporal differences alone, with the conservative term (CQL), with its max (Cal-QL)
     seconds      what an update costs
-    joined       recorded runs: A to D of data/sweeps/calql.toml, E of data/sweeps/leaderboard.toml
+    joined       recorded runs: on Door A to D of data/sweeps/calql.toml, E of leaderboard.toml; on StackCube all of calql_stackcube.toml
 """
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ import pandas as pd
 import torch
 
 from . import unlearning
-from .compare import available, start_of
+from .compare import available, record_of, start_of
 from .decorator import critic_features
 from .demos import sources
 from .errors import PdkitError
@@ -145,8 +145,10 @@ def seconds(letter: str, online: str, count: int = 5, **changes: Any) -> float:
 # ---- recorded runs ---------------------------------------------------------------------------------------------------
 
 def joined(task: str = "Door") -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Recorded runs and curves of all setups that there are, E from the comparison of methods; a printed sentence for each record that is
-    missing. Raises PdkitError where E had another budget, offline stage or number of test episodes than A to D."""
+    """Recorded runs and curves of all setups that there are, on Door E from the comparison of methods; a printed sentence for each record
+    that is missing. Raises PdkitError where E had another budget, offline stage or number of test episodes than A to D."""
+    if task != "Door":
+        return available(record_of("calql", task), task)
     return _joined(*available("calql"), *available("leaderboard"), task)
 
 

@@ -177,7 +177,7 @@ def moved_by_critics(drifts: Mapping[str, float]) -> tuple[str, list[str]]:
     """
     still = all(drifts[kind] == 0 for kind in ("mlp", "separate"))
     return ("reproduced" if still and drifts["shared"] > 0 else "not"), [
-        f"{KINDS[kind]}: critic updates alone move an action by {value:.4f} per joint" for kind, value in drifts.items()]
+        f"{KINDS[kind]}: critic updates alone move an action by {value:.4f} per dimension" for kind, value in drifts.items()]
 
 
 # ---- recorded runs ---------------------------------------------------------------------------------------------------

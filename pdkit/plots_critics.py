@@ -30,7 +30,7 @@ def drifts_figure(rows: pd.DataFrame, labels: Mapping[str, str], title: str = ""
         ax.set(xlabel="updates", xlim=(0, None), ylim=(min(0.0, -0.03 * rows[rows.stage == stage].drift.max()), None))
         thousands(ax, integer=True)
         ax.set_title(stage)
-    axes[0, 0].set_ylabel("mean |a - a0| per joint")
+    axes[0, 0].set_ylabel("mean |a - a0| per dimension")
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=len(labels), fontsize=9)
     figure.suptitle(title, x=0.01, ha="left", weight="bold", fontsize=12)
     return figure
@@ -108,7 +108,7 @@ def returns_figure(rows: pd.DataFrame, lowest: float) -> Picture:
     ax.annotate("never solved", (lowest, 1), (5, -10), xycoords=("data", "axes fraction"), textcoords="offset points", fontsize=8.5)
     ax.set(xlabel="return of state and action", ylabel="rows of the offline data")
     ax.set_title("Good and bad news in the offline data")
-    ax.legend(fontsize=8.5, loc="upper center")
+    figure.legend(loc="outside lower center", ncols=2, fontsize=8.5)
     return figure
 
 

@@ -43,7 +43,7 @@ def directions_figure(cosines: Sequence[np.ndarray], dim: int, sizes: dict[str, 
     ax.set_xticks(range(len(sizes)), list(sizes))
     ax.set_xlim(-0.6, len(sizes) - 0.4)
     ax.grid(axis="x", visible=False)
-    ax.set_title("How hard (mean per joint)")
+    ax.set_title("How hard (mean per dimension)")
     return figure
 
 
@@ -61,7 +61,7 @@ def drift_figure(drifts: pd.DataFrame, *, bound: float, distance: float) -> Pict
                 fontsize=8.5)
     ax.annotate("distance to the better policy", (right, distance), (-2, -12), textcoords="offset points", ha="right", color="#888888",
                 fontsize=8.5)
-    ax.set(xlabel="updates of the actor", ylabel="mean |a - a0| per joint", xlim=(0, right * 1.02), ylim=(0, None))
+    ax.set(xlabel="updates of the actor", ylabel="mean |a - a0| per dimension", xlim=(0, right * 1.02), ylim=(0, None))
     ax.set_title("How far the policy has drifted")
     figure.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=5, fontsize=9)
     return figure

@@ -195,7 +195,9 @@ def test_joined_takes_e_from_the_leaderboard_and_only_there(tmp_path, monkeypatc
     write("leaderboard", ["calql", "calql_a", "rot"], steps=40_004)
     table, curves = calql_analysis.joined()
     assert set(table.recipe) == set(curves.recipe) == set(SETUPS) and len(table) == 15 and (table.recipe == "calql_a").sum() == 3
-    assert calql_analysis.joined("Pen")[0].empty and not capsys.readouterr().out
+    assert calql_analysis.joined("StackCube")[0].empty and "pdkit sweep data/sweeps/calql_stackcube.toml" in capsys.readouterr().out
+    run_rows(SETUPS, task="StackCube").to_csv(tmp_path / "results" / "calql_stackcube.csv", index=False)
+    assert set(calql_analysis.joined("StackCube")[0].recipe) == set(SETUPS)
     for other in (dict(steps=20_000), dict(episodes=200), dict(offline=3_000)):
         write("leaderboard", ["calql"], **other)
         with pytest.raises(PdkitError, match="another budget"):

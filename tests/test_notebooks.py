@@ -168,7 +168,7 @@ def test_calql(tmp_path):
 @pytest.mark.parametrize("name, parameters", [("07", {}), ("08", dict(updates=2)), ("09", dict(own_setup="C"))])
 def test_what_becomes_of_fine_tuning_on_the_cube(tmp_path, name, parameters):
     result = run(name, tmp_path, task="StackCube", **parameters)
-    assert result["task"] == "StackCube" and result.get("recorded_runs", 0) == 0
+    assert result["task"] == "StackCube"
     if name == "07":  # the target entropy is the paper's, not that of the lesson recipe, which lets no temperature rise
         assert result["runs"]["warm"]["temperature"] > 1
     if name == "09":

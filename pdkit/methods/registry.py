@@ -39,7 +39,8 @@ def base_folder(method: str, task: str) -> Path:
     m, folder = get_method(method), DATA / "checkpoints" / get_task(task).name / get_method(method).base
     if not (folder / "policy.json").exists():
         kind = "" if m.base == "base" else f" --policy {m.base}"
-        raise PdkitError(f"{m.title} starts from a policy that does not come with the kit for {task}: train one with "
+        have = ", ".join(sorted(path.parts[-3] for path in (DATA / "checkpoints").glob(f"*/{m.base}/policy.json"))) or "no task"
+        raise PdkitError(f"{m.title} starts from a policy that comes with the kit for {have}, not for {task}: train one with "
                          f"`pdkit train base {task}{kind}` and give its folder as the base (--base).")
     return folder
 
