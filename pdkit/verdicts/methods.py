@@ -99,7 +99,8 @@ def _() -> Finding:
     one, two = found.values()
     return replace(one, tasks=f"{one.tasks} {two.tasks}", seeds=" ".join(sorted({*one.seeds.split(), *two.seeds.split()})),
                    measured=f"ManiSkill {one.measured}, Adroit {two.measured}", interval=f"{one.interval}; {two.interval}",
-                   verdict=jointly(one.verdict, two.verdict), command=f"{one.command}; {two.command}")
+                   verdict=jointly(one.verdict, two.verdict),
+                   command="; ".join(dict.fromkeys(f"{one.command}; {two.command}".split("; "))))
 
 
 @measures("With BeT bases, Policy Decorator")
