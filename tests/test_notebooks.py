@@ -53,7 +53,7 @@ BUDGETS = [  # notebook, sweep, what its prose says of the sweep's [fixed] (lead
     ("09", "calql", "{calql_offline_updates:,} offline updates (half of the table's)"),
     ("09", "calql", "the budget is {total_steps:,} steps"),
     ("09", "calql", "An evaluation has {eval_episodes} episodes a seed"),
-    ("11", "leaderboard", "`own_steps = {total_steps:_}`: your runs end where the recorded ones do"),
+    ("11", "leaderboard", "`own_steps = {total_steps:_}` (StackCube: `60_000`): your runs end where the recorded ones do"),
     ("13", "ablations", "the dot the *last* policy, tested on {episodes};"),
     ("13", "ablations", "H=0 total_steps={total_steps:_}"),
     ("16", "leaderboard", "evaluations on {eval_episodes} episodes for each seed (JSRL: {jsrl_episodes})"),
@@ -165,7 +165,7 @@ def test_calql(tmp_path):
     assert (tmp_path / "calibration.png").exists() and result["exercise_solved"] is False
 
 
-@pytest.mark.parametrize("name, parameters", [("07", {}), ("08", dict(updates=2)), ("09", dict(own_setup="C"))])
+@pytest.mark.parametrize("name, parameters", [("07", {}), ("08", dict(updates=2, own_steps=300)), ("09", dict(own_setup="C"))])
 def test_what_becomes_of_fine_tuning_on_the_cube(tmp_path, name, parameters):
     result = run(name, tmp_path, task="StackCube", **parameters)
     assert result["task"] == "StackCube"
