@@ -243,7 +243,7 @@ def test_figures_of_08_draw_what_they_are_given():
 def test_figures_of_09_draw_what_they_are_given():
     steps = pd.DataFrame({"source": ["demonstrations"] * 3 + ["rollouts"], "mc": [-10.0, -5.0, 0.0, -33.3]})
     figure = plots_critics.returns_figure(steps, -33.3)
-    assert sum(p.get_height() for p in figure.axes[0].patches) == 4 and "3 rows" in figure.axes[0].get_legend().texts[0].get_text()
+    assert sum(p.get_height() for p in figure.axes[0].patches) == 4 and "3 rows" in figure.legends[0].get_texts()[0].get_text()
     values = dict(data=-1.0, random=-3.0)
     rows = pd.DataFrame([{"loss": loss, "update": u, "policy": -2.0 * u} | values for loss in ("x", "y") for u in (0, 1)])
     figure = plots_critics.calibration_figure(rows, -7.0)
