@@ -5,8 +5,8 @@ This module imports only the standard library, so that `pd --help` answers at on
 from __future__ import annotations
 
 import argparse
-import importlib.util
 import os
+import re
 import sys
 from collections.abc import Callable
 from importlib import import_module
@@ -16,6 +16,7 @@ from typing import NoReturn
 from . import __version__
 from .errors import PdkitError, unknown
 from .files import ROOT
+from .machine import cores
 
 VERBS = {  # verb: (what it does, the function that does it, given the remaining arguments)
     "run": ("the main job: a base policy, decorated by online RL, on Adroit Door or another task", "pdkit.main_job:main"),
@@ -107,9 +108,9 @@ def test(argv: list[str]) -> int:
     import pytest
 
     os.chdir(ROOT)
-    serial = ("-n", "--numprocesses", "--pdb", "--trace", "-s", "--capture=no", "no:xdist")
-    alone = any(os.path.exists(a.split("::")[0]) or a.startswith(serial) for a in argv) or not importlib.util.find_spec("xdist")
-    workers = min(4, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
+    serial = re.compile(r"-n|--numprocesses|--pdb|--trace|--capture=no|-[a-z]*s$|(-p)?no:xdist")  # by arguments, -vs among them
+    alone = any(os.path.exists(a.split("::")[0]) or serial.match(a) for a in argv) or not find_spec("xdist")
+    workers = min(4, cores())
     return int(pytest.main(argv if alone or workers < 2 else ["-n", str(workers), "--dist", "worksteal", *argv]))
 
 

@@ -189,7 +189,7 @@ def budgets(table: pd.DataFrame, labels: Mapping[str, str]) -> pd.DataFrame:
         batch = m.ppo_rollout * config.num_envs // m.ppo_minibatches if on_policy else config.batch
         demos = f"{config.demo_fraction:.0%} of a batch" if config.demo_fraction else \
             "yes, not in batches" if trainer_of(method).needs_demos else "none"
-        start = "nothing" if from_scratch(recipe) else STARTS[start_of(method, task).name]
+        start = "nothing" if from_scratch(recipe) else STARTS[start_name(method, task)]
         rows.append({"method": label, "starts from": start, "demonstrations": demos,
                      "environment steps": f"{mine.env_steps.mean():,.0f}", "updates": f"{mine.updates.mean():,.0f}",
                      "transitions an update": f"{batch:,}", "minutes": f"{mine.train_minutes.mean():.1f}"})
@@ -198,11 +198,17 @@ def budgets(table: pd.DataFrame, labels: Mapping[str, str]) -> pd.DataFrame:
 
 # ---- a run of the reader's own ---------------------------------------------------------------------------------------
 
+def start_name(method: str, task: str) -> str:
+    """What the policy is called that the comparisons give to a method: the method's own (pdkit/methods/registry.py), but where that is the
+    task's base policy that of DECORATED. A method from scratch is given one, too: Cal-QL's setups A to C learn from its episodes."""
+    name = get_method(method).base
+    return DECORATED.get(task, name) if name == "base" else name
+
+
 def start_of(method: str, task: str) -> Path:
-    """Where the policy lies that the comparisons start a method from: the one that comes with the kit, but for methods that decorate the
-    base policy that of DECORATED. Raises PdkitError for an unknown method, and where the kit has no such policy."""
+    """Where the policy of `start_name` lies that comes with the kit. Raises PdkitError for an unknown method, and where there is none."""
     folder = base_folder(method, task)
-    return folder.with_name(DECORATED.get(task, "base")) if folder.name == "base" and not from_scratch(method) else folder
+    return folder.with_name(start_name(method, task))
 
 
 def own_run(method: str, task: str, profile: str, seed: int, folder: Path, episodes: int, recipe: str = "", base: Path | None = None,

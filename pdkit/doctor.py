@@ -20,7 +20,7 @@ from pathlib import Path
 
 from .errors import PdkitError
 from .files import DATA, ROOT, read_json, runs_root, sha256, write_json
-from .machine import MUJOCO_DRAWS, SAPIEN_DRAWS, cpu_has_bf16
+from .machine import MUJOCO_DRAWS, SAPIEN_DRAWS, cores, cpu_has_bf16
 
 REINSTALL = "run ./pd doctor, or pip install -r environment.txt"
 TIMEOUT = 60  # seconds a probe may take; a busy machine is slow, a hung driver never ends
@@ -138,12 +138,11 @@ def check_torch() -> list[Check]:
     if not good:
         return [Check("FAIL", "torch", text, REINSTALL)]
     seen = json.loads(text)
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     device = seen["cuda"] or "the CPU (no CUDA device; none is needed)"
     checks = [Check("OK", "torch", f"{seen['version']} on {device}")]
-    text = f"{seen['threads']} threads, {cores} cores"
-    fix = f"set OMP_NUM_THREADS={cores}: more threads than cores is many times slower"
-    checks.append(Check("WARN", "threads", text, fix) if seen["threads"] > cores else Check("OK", "threads", text))
+    text = f"{seen['threads']} threads, {cores()} cores"
+    fix = f"set OMP_NUM_THREADS={cores()}: more threads than cores is many times slower"
+    checks.append(Check("WARN", "threads", text, fix) if seen["threads"] > cores() else Check("OK", "threads", text))
     ratio, flag = seen["bfloat16"] / seen["float32"], cpu_has_bf16()
     text = (f"one core: {seen['float32']:.0f} GFLOP/s in float32, {seen['bfloat16']:.0f} in bfloat16 ({ratio:.1f}x); "
             f"the CPU says {'yes' if flag else 'no'}")

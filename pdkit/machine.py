@@ -1,7 +1,13 @@
 """What this machine can do, asked without importing anything that may be broken: standard library only, for `pdkit doctor` too."""
 from __future__ import annotations
 
+import os
 from pathlib import Path
+
+
+def cores() -> int:
+    """How many cores this process may use, or, where the system does not tell, how many there are."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def cpu_has_bf16() -> bool:

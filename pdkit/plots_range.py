@@ -60,6 +60,7 @@ def bounds_figure(table: pd.DataFrame, reached: pd.DataFrame | None = None, titl
     figure, axes = blank(-(-len(tasks) // 4), min(4, len(tasks)), size=(2.5 * min(4, len(tasks)) + 0.4, 2.2 * -(-len(tasks) // 4) + 0.7))
     least = table.alpha[table.alpha > 0].min() if table.alpha.any() else 0.1
     most = max(table.alpha.max(), reached.alpha.max() if reached is not None else 0)
+    ticks = sorted(set.intersection(*(set(table.alpha[table.task == task]) for task in tasks)))  # a task's own bound would crowd them
     for ax, task in zip(axes.flat, tasks, strict=False):
         rows = table[table.task == task].sort_values("alpha")
         ax.fill_between(rows.alpha, rows.low, rows.high, color=COLORS["base"], alpha=0.2, lw=0)
@@ -67,7 +68,6 @@ def bounds_figure(table: pd.DataFrame, reached: pd.DataFrame | None = None, titl
         for row in reached[reached.task == task].itertuples() if reached is not None else ():
             ax.plot(row.alpha, row.success, "D", ms=6, color=COLORS["decorated"])
         ax.set_xscale("symlog", linthresh=least)  # 0, the base policy alone, stands on it too
-        ticks = sorted(set(table.alpha))
         ax.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
         ax.xaxis.set_minor_locator(mpl.ticker.NullLocator())
         ax.set(title=task, ylim=(0, 1.04), xlim=(-least / 4, most * 1.3))

@@ -1,7 +1,6 @@
 """A run's folder: manifest.json (what was asked, with what, where), metrics.csv, checkpoint/ (safetensors + json)."""
 from __future__ import annotations
 
-import os
 import platform
 import subprocess
 import time
@@ -15,6 +14,7 @@ import pandas as pd
 
 from .errors import PdkitError
 from .files import ROOT, atomic_file, atomic_folder, read_json, sha256, write_json
+from .machine import cores
 
 PACKAGES = ("torch", "numpy", "gymnasium", "gymnasium-robotics", "mujoco", "mani-skill", "sapien")
 
@@ -42,8 +42,7 @@ def describe_machine() -> dict[str, Any]:
             versions[name] = metadata.version(name)
         except metadata.PackageNotFoundError:
             versions[name] = None
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return {"python": platform.python_version(), "system": f"{platform.system()} {platform.machine()}", "cores": cores,
+    return {"python": platform.python_version(), "system": f"{platform.system()} {platform.machine()}", "cores": cores(),
             "torch_threads": torch.get_num_threads(),
             "cuda": torch.cuda.is_available() and torch.cuda.get_device_name(), "versions": versions, "git": _git()}
 

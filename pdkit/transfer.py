@@ -2,7 +2,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,7 @@ import pandas as pd
 from . import video
 from .cli import Parser
 from .decorated import Decorated, load_decorated
+from .demos.cli import Progress
 from .errors import PdkitError
 from .evaluate import evaluate
 from .oracle import by_bound
@@ -82,12 +82,9 @@ def corrected(kind: str, policy: Policy | Decorated, args: argparse.Namespace) -
     if kind != "base" or encoder_of(args.policy):
         raise PdkitError("--oracle corrects a base policy that is told the state; name the folder of one.")
 
-    def progress(alpha: float, done: int) -> None:
-        if done % 10 == 0 or done == args.episodes:
-            print(f"\ralpha {alpha:g}: {done} of {args.episodes} episodes", end="\n" if done == args.episodes else "", file=sys.stderr)
-
     for task in args.tasks:
-        rows = by_bound(get_task(task), policy, args.oracle, reported_seeds(args.episodes), progress)
+        rows = by_bound(get_task(task), policy, args.oracle, reported_seeds(args.episodes),
+                        Progress(args.episodes * len(args.oracle), "episodes"))
         for row in rows.itertuples():
             print(f"{task}, corrected by at most {row.alpha:g}: {wilson(round(row.success * row.episodes), row.episodes)}")
         if args.record:

@@ -1,5 +1,4 @@
 """The command line: fast, one sentence for each mistake, the right exit codes."""
-import os
 import subprocess
 import sys
 import time
@@ -83,12 +82,14 @@ SHARED = ["--dist", "worksteal"]
 @pytest.mark.parametrize("cores, argv, before", [
     (2, ["--slow"], ["-n", "2", *SHARED]), (64, [], ["-n", "4", *SHARED]), (2, ["-k", "sac"], ["-n", "2", *SHARED]),
     (1, [], []), (2, ["tests/test_cli.py::test_lab"], []), (2, ["-n", "0"], []), (2, ["--pdb"], []),
-    (2, ["-s"], []), (2, ["-p", "no:xdist"], []),
+    (2, ["-s"], []), (2, ["-vs"], []), (2, ["-p", "no:xdist"], []), (2, ["-pno:xdist"], []),
+    (2, ["-v"], ["-n", "2", *SHARED]),
 ])
 def test_all_tests_share_the_cores_and_those_of_a_path_do_not(monkeypatch, cores, argv, before):
     called = []
     monkeypatch.setattr(pytest, "main", lambda argv: called.extend(argv) or 0)
-    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: set(range(cores)), raising=False)
+    monkeypatch.setattr(cli, "cores", lambda: cores)
+    monkeypatch.setattr(cli, "find_spec", lambda name: True)
     monkeypatch.chdir(cli.ROOT)
     for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
         monkeypatch.setenv(name, "1")  # put back afterwards
@@ -98,7 +99,8 @@ def test_all_tests_share_the_cores_and_those_of_a_path_do_not(monkeypatch, cores
 def test_without_the_package_that_shares_them_tests_run_one_after_the_other(monkeypatch):
     called = []
     monkeypatch.setattr(pytest, "main", lambda argv: called.extend(argv) or 0)
-    monkeypatch.setattr(cli.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(cli, "cores", lambda: 2)
+    monkeypatch.setattr(cli, "find_spec", lambda name: None)
     monkeypatch.chdir(cli.ROOT)
     for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
         monkeypatch.setenv(name, "1")

@@ -187,8 +187,9 @@ def test_a_bound_works_where_it_helps_and_hardly_any_is_better(near, best, base,
 
 def test_comparisons_start_from_a_behavior_transformer():
     folders = {(method, task): compare.start_of(method, task).relative_to(DATA / "checkpoints").as_posix() for method, task in (
-        ("policy_decorator", "Door"), ("policy_decorator", "StackCube"), ("sac_finetune", "StackCube"), ("fish", "Door"))}
-    assert list(folders.values()) == ["Door/base", "StackCube/bet-sac", "StackCube/bet-sac", "Door/vinn"]
+        ("policy_decorator", "Door"), ("policy_decorator", "StackCube"), ("sac_finetune", "StackCube"), ("calql_a", "StackCube"),
+        ("fish", "Door"))}
+    assert list(folders.values()) == ["Door/base", "StackCube/bet-sac", "StackCube/bet-sac", "StackCube/bet-sac", "Door/vinn"]
     assert all(load_policy(DATA / "checkpoints" / f).kind in (*claims.BETS, "vinn") for f in folders.values())
 
 

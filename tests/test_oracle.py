@@ -61,7 +61,7 @@ def test_who_shows_the_way():
     """An expert that looks at the simulation is given it; where no expert is scripted, the agent that made the demonstrations acts."""
     sim = object()
     guide = oracle.demonstrator("TurnFaucet", sim)
-    assert isinstance(guide._expert, TurnFaucetExpert) and guide._expert._sim is sim
+    assert isinstance(guide.expert, TurnFaucetExpert) and guide.expert._sim is sim
     assert oracle.demonstrator("Pen", sim).base.config["act_dim"] == 24
 
 

@@ -118,7 +118,8 @@ def _fetched(spec: TaskSpec, path: Path) -> Path:
                 file.write(block)
                 if file.tell() > MOST:
                     raise PdkitError(f"{url} gives more than {MOST / 1e9:.0f} GB, more than the hub has, so it is not the archive "
-                                     f"that was meant: use the scripted expert's, `pdkit demos {spec.name}`.")
+                                     f"that was meant: use the scripted expert's, `pdkit demos {spec.name}`, or name a file that you "
+                                     "have with --from.")
     except (urllib.error.URLError, http.client.HTTPException, TimeoutError, ConnectionError) as error:
         raise PdkitError(f"ManiSkill's demonstrations of {spec.name} could not be fetched ({getattr(error, 'reason', error)}); they need a "
                          f"network the first time: use the scripted expert's, `pdkit demos {spec.name}`, or download {url} where there is "

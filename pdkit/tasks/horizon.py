@@ -42,6 +42,30 @@ class Guide(Protocol):
         """Action chunks (1, 1, act_dim) for windows (1, window, obs_dim)."""
 
 
+def walk(sim: Sim, guide: Guide, seed: int, limit: int) -> np.ndarray | None:
+    """The guide's actions (T, act_dim) from reset(seed) until its first success, None where it does not get there in `limit` steps.
+
+    Leaves torch as it was: a base policy may draw from its global generator, and a guide in a worker must round as one in this process.
+    """
+    import torch
+
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        with own_random_numbers():
+            guide.reset(seed)
+            window, actions = np.repeat(sim.reset(seed)[None], guide.window, axis=0), []
+            while len(actions) < limit:
+                actions.append(np.clip(guide.act(window[None])[0, 0], -1, 1).astype(np.float32))
+                observation, solved = sim.step(actions[-1])
+                if solved:
+                    return np.stack(actions)
+                window = np.concatenate([window[1:], observation[None]])
+    finally:
+        torch.set_num_threads(threads)
+    return None
+
+
 class Ways:
     """The ways of a guide, by seed; the last REMEMBERED of them are kept."""
 
@@ -59,7 +83,7 @@ class Ways:
             return self._kept[seed]
         for attempt in range(TRIES):
             actual = seed if attempt == 0 else FURTHER + int(np.random.SeedSequence([seed, attempt]).generate_state(1)[0]) % FURTHER
-            actions = self._walk(sim, actual)
+            actions = walk(sim, self.guide, actual, self.limit)
             if actions is not None:
                 break
         else:
@@ -69,27 +93,6 @@ class Ways:
         if len(self._kept) > REMEMBERED:
             self._kept.popitem(last=False)
         return actual, actions
-
-    def _walk(self, sim: Sim, seed: int) -> np.ndarray | None:
-        """The guide's actions until its first success, None where it does not get there. Leaves torch as it was: a base policy may
-        draw from its global generator, and a guide in a worker must round as one in this process."""
-        import torch
-
-        threads = torch.get_num_threads()
-        torch.set_num_threads(1)
-        try:
-            with own_random_numbers():
-                self.guide.reset(seed)
-                window, actions = np.repeat(sim.reset(seed)[None], self.guide.window, axis=0), []
-                while len(actions) < self.limit:
-                    actions.append(np.clip(self.guide.act(window[None])[0, 0], -1, 1).astype(np.float32))
-                    observation, solved = sim.step(actions[-1])
-                    if solved:
-                        return np.stack(actions)
-                    window = np.concatenate([window[1:], observation[None]])
-        finally:
-            torch.set_num_threads(threads)
-        return None
 
 
 class HorizonSim:
@@ -153,29 +156,31 @@ class Scripted:
     window = 1
 
     def __init__(self, expert: Any):
-        self._expert = expert
+        self.expert = expert
 
     def reset(self, seed: int) -> None:
-        self._expert.reset(np.random.default_rng(seed))
+        self.expert.reset(np.random.default_rng(seed))
 
     def act(self, windows: np.ndarray) -> np.ndarray:
-        return self._expert.act(windows[0, -1])[None, None]
+        return self.expert.act(windows[0, -1])[None, None]
 
 
-def _demonstrator(task: str) -> Guide:
+def demonstrator(task: str) -> Guide:
+    """The agent that made the demonstrations of a task."""
     from ..decorated import load_decorated
     from ..files import DATA
 
     return load_decorated(DATA / "checkpoints" / task / "demonstrator")
 
 
-def _scripted(task: str) -> Guide:
+def scripted(task: str) -> Scripted:
+    """The scripted expert of a task."""
     from ..demos.experts import EXPERTS
 
     return Scripted(EXPERTS[task]())
 
 
-GUIDES: dict[str, Callable[[str], Guide]] = {"Door": _demonstrator, "StackCube": _scripted}
+GUIDES: dict[str, Callable[[str], Guide]] = {"Door": demonstrator, "StackCube": scripted}
 
 
 @functools.cache

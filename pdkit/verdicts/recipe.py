@@ -89,23 +89,17 @@ def _() -> Finding:
 
 # ---- other base policies ---------------------------------------------------------------------------------------------
 
-def _swept(recipe: str) -> bool:
-    """Whether the sweep of base policies has enough seeds of it, whatever they tell."""
-    try:
-        return bool(len(by_seed(recorded("base_policies")[0], recipe, "decorated_success")))
-    except TooLittle:
-        return False
-
-
 def _improves(recipe: str) -> Finding:
     """Significantly: by more than 20 points (ours, as for a low-performing checkpoint). The paper's task is TurnFaucet. Where the
     sweep of base policies has too few seeds, the main job's rows on TurnFaucet answer, whose best evaluated policy is tested."""
-    if _swept(recipe):
-        return compared("base_policies", recipe, second_column="base_success", enough=0.2, paper=("TurnFaucet",))
-    runs = recorded("main_job")[0]
-    runs = runs[(runs.task == "TurnFaucet") & (runs.policy == recipe)].assign(recipe=recipe)
-    end, start = (by_seed(runs, recipe, column) for column in ("decorated_success", "base_success"))
-    return set_against("main_job", end, start, (f"{recipe} (best evaluation)", "its base policy"), enough=0.2)
+    try:
+        by_seed(recorded("base_policies")[0], recipe, "decorated_success")
+    except TooLittle:
+        runs = recorded("main_job")[0]
+        runs = runs[(runs.task == "TurnFaucet") & (runs.policy == recipe)].assign(recipe=recipe)
+        end, start = (by_seed(runs, recipe, column) for column in ("decorated_success", "base_success"))
+        return set_against("main_job", end, start, (f"{recipe} (best evaluation)", "its base policy"), enough=0.2)
+    return compared("base_policies", recipe, second_column="base_success", enough=0.2, paper=("TurnFaucet",))
 
 
 measures("Policy Decorator significantly improves an MLP")(partial(_improves, "mlp"))
