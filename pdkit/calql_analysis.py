@@ -16,7 +16,7 @@ import pandas as pd
 import torch
 
 from . import unlearning
-from .compare import available, record_of, start_of
+from .compare import available, start_of
 from .decorator import critic_features
 from .demos import sources
 from .errors import PdkitError
@@ -25,6 +25,7 @@ from .online import Trainer
 from .online_rows import demo_rows
 from .policies import load_policy
 from .policies.base import read_card
+from .recorded import record_of
 
 SETUPS = {"A": "calql_a", "B": "calql_b", "C": "calql_c", "D": "calql_d", "E": "calql"}
 LOSSES = ("TD alone", "CQL", "Cal-QL")

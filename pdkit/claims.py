@@ -9,6 +9,8 @@ Every verdict follows one of few rules, so that no one is tempted to choose the 
   whole interval does; **partly**: the right side, but the interval reaches over zero;
 - a claim of several parts is **reproduced** when all are, **not** when none is and one is "not", else **partly**; a statement with
   several conditions (such as "works") has the weakest verdict among them;
+- runs of several tasks, from one record or from those of a comparison on Door and on others (recorded.record_of), are judged by the mean
+  over the tasks, and each task's own mean is told beside it;
 - where the claim is about more tasks than were run, "reproduced" counts as **partly**;
 - fewer than three seeds are no test, and neither are two sides that both solve hardly anything: the budget does not tell them apart.
 """
@@ -23,7 +25,7 @@ from scipy import stats
 
 from .errors import PdkitError
 from .files import DATA
-from .recorded import load
+from .recorded import load, record_of
 from .stats import Interval
 
 LEAST_SEEDS = 3
@@ -253,14 +255,15 @@ def finding(record: str | Sequence[str], values: pd.Series, measured: str, inter
     if verdict == "reproduced" and not set(paper) <= set(tasks):
         verdict = "partly"
     seeds = " ".join(str(seed) for seed in sorted(set(values.index.get_level_values("seed"))))
-    records = [record] if isinstance(record, str) else [name for name in record if set(recorded(name)[0].task) & set(tasks)]
-    made = [command for name in records for command in commands(name, tasks)]
+    records = [part for name in ([record] if isinstance(record, str) else record) for part, (table, _) in _records(name).items()
+               if set(table.task) & set(tasks)]
+    made = [command for part in records for command in commands(part, tasks)]
     return Finding(" ".join(tasks), seeds, measured, interval, verdict, "; ".join(made))
 
 
 def commands(record: str, tasks: Sequence[str]) -> list[str]:
     """What makes the rows of these tasks: the column `sweep` where it is recorded, else a sweep of that name, else the rows' commands."""
-    table, _ = recorded(record)
+    table, _ = _records(record)[record]
     mine, spec = table[table.task.isin(tasks)], DATA / "sweeps" / f"{record}.toml"
     known = mine.sweep.dropna() if "sweep" in mine else []
     if len(known) or spec.exists() or "command" not in mine:
@@ -274,8 +277,22 @@ def commands(record: str, tasks: Sequence[str]) -> list[str]:
 
 
 def recorded(name: str) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """`load`, with TooLittle where nothing is recorded."""
-    try:
-        return load(name)
-    except PdkitError as error:
-        raise TooLittle(str(error)) from None
+    """Rows and curves of a comparison: those on Door, or in a record of all tasks, and those of its records on other tasks
+    (recorded.record_of). Raises TooLittle where nothing is recorded."""
+    tables, curves = zip(*_records(name).values(), strict=True)
+    return pd.concat(tables, ignore_index=True), pd.concat(curves, ignore_index=True)
+
+
+def _records(name: str) -> dict[str, tuple[pd.DataFrame, pd.DataFrame]]:
+    """The same, record by record. Rows of a notebook that names no task are Door's."""
+    found, missing = {}, []
+    for part in (name, *(record_of(name, task) for tasks in TASKS.values() for task in tasks if task != "Door")):
+        try:
+            table, curves = load(part)
+        except PdkitError as error:
+            missing.append(error)
+            continue
+        found[part] = table.assign(task=table.task.where(~table.task.astype(str).str.match(r"\d"), "Door")), curves
+    if not found:
+        raise TooLittle(str(missing[0])) from None
+    return found

@@ -61,11 +61,6 @@ def available(name: str, task: str | None = None) -> tuple[pd.DataFrame, pd.Data
         return pd.DataFrame(columns=["task", "recipe", "seed"]), pd.DataFrame(columns=["task", "recipe", "seed", "step"])
 
 
-def record_of(name: str, task: str) -> str:
-    """What the results of a comparison that Door's sweep `name` makes are called on a task: those of another have a sweep of their own."""
-    return name if task == "Door" else f"{name}_{task.lower()}"
-
-
 def method_of(recipe: str) -> str:
     """The method of a recipe METHOD,NAME=VALUE. Raises PdkitError for an unknown one."""
     name = recipe.split(",")[0]

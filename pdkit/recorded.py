@@ -61,6 +61,11 @@ def load(name: str, task: str | None = None) -> tuple[pd.DataFrame, pd.DataFrame
     return table.reset_index(drop=True), lines[lines.task.isin(table.task)].reset_index(drop=True)
 
 
+def record_of(name: str, task: str) -> str:
+    """What the results of a comparison that Door's sweep `name` makes are called on a task: those of another have a sweep of their own."""
+    return name if task == "Door" else f"{name}_{task.lower()}"
+
+
 def by_arm(table: pd.DataFrame, group: str, field: str, name: str) -> pd.DataFrame:
     """A notebook's recorded rows, whose columns are called GROUP.ARM.FIELD, as one row an arm and seed: recipe (the arm), seed, `name`.
 

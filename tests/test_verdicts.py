@@ -280,6 +280,26 @@ def test_a_finding_names_the_sweeps_that_made_its_rows(results):
     assert verdicts.find("Policy Decorator with PPO in place of SAC improves the base policy.").command.count("pdkit sweep") == 2
 
 
+def test_the_record_of_another_task_is_judged_with_doors(results):
+    """Door gains 30 points (five seeds), StackCube loses 10 (three, in a record of its own): 10 on average, each named with its sweep."""
+    claim = "A residual policy that sees the observation alone typically does better than one that also sees the base action."
+    door = [runs(recipe, [end] * 4 + [end + 0.001]) for recipe, end in ((ablations.GRID, 0.8), ("actor_input=obs+base", 0.5))]
+    cube = [runs(recipe, [end + 0.001, end, end], task="StackCube")
+            for recipe, end in ((ablations.GRID, 0.5), ("actor_input=obs+base", 0.6))]
+    write(results, "ablations", *door)
+    alone = verdicts.find(claim)
+    assert (alone.tasks, alone.seeds, alone.command) == ("Door", "0 1 2 3 4", "pdkit sweep data/sweeps/ablations.toml")
+    write(results, "ablations_stackcube", *cube)
+    both = verdicts.find(claim)
+    assert both.tasks == "Door StackCube" and "+10.0 points (Door +30.0, StackCube -10.0)" in both.measured
+    assert both.command == "pdkit sweep data/sweeps/ablations.toml; pdkit sweep data/sweeps/ablations_stackcube.toml"
+    write(results, "ablations_stackcube", *(rows[:2] for rows in cube))  # two seeds are no test of a task
+    assert verdicts.find(claim) == alone
+    (results / "ablations.csv").unlink()
+    write(results, "ablations_stackcube", *cube)
+    assert verdicts.find(claim).tasks == "StackCube"
+
+
 def test_commands_that_differ_in_their_seed_are_one(results):
     rows = runs("lesson", [0.9, 0.8, 0.7], command=[f"pdkit train decorated Door --seeds {seed} --set utd=1" for seed in range(3)])
     write(results, "recipe_search", rows, runs("lesson", [0.5], task="Pen", command="pdkit something"))

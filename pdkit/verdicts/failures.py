@@ -28,6 +28,7 @@ from ..claims import (
     recorded,
     set_against,
     signed,
+    task_by_task,
     times,
     told_apart,
     turned,
@@ -37,8 +38,6 @@ from ..stats import Interval
 from .registry import EIGHT, measures
 
 # ---- Cal-QL, setups A to E (appendix F.3); E is the comparison's cell ---------------------------------------------------
-
-BOTH = "pdkit sweep data/sweeps/calql.toml; pdkit sweep data/sweeps/leaderboard.toml"  # setups A to D, and E
 
 
 @measures("A critic pre-trained by Cal-QL on demonstrations alone")
@@ -64,7 +63,8 @@ def _efficiency(first: str, second: str) -> tuple[Interval, pd.Series, str]:
     told_apart(one, two)
     one, two = matched(one, two)
     interval, values = difference(one, two)
-    return interval, values, f"mean success over the online evaluations {percent(one.mean())} and {percent(two.mean())}"
+    return interval, values, (f"mean success over the online evaluations {percent(average(one))} and {percent(average(two))}"
+                              f"{task_by_task(values, signed)}")
 
 
 @measures("Cal-QL needs negative trajectories")
@@ -80,7 +80,7 @@ def _() -> Finding:
     interval, values, told = _efficiency("calql_b", "calql_c")
     ends = by_seed(recorded("calql")[0], "calql_c", "decorated_success")
     high = mean_interval(ends)
-    return finding("calql", values, f"B and C: {told}; C ends at {percent(ends.mean())}",
+    return finding("calql", values, f"B and C: {told}; C ends at {percent(average(ends))}{task_by_task(ends, percent)}",
                    f"cost {points(interval)}; C {percent(high.low)} to {percent(high.high)}",
                    jointly(judged(turned(interval), -0.1), judged(high, 0.9)))
 
@@ -93,10 +93,12 @@ def _() -> Finding:
     table, _ = recorded("calql")
     table = table[table.load_average <= table.cores + 1]
     ratios = np.log(by_seed(table, "calql_b", "train_minutes") / by_seed(table, "calql_c", "train_minutes")).dropna()
-    if ratios.index.get_level_values("seed").nunique() < LEAST_SEEDS:
+    ratios = ratios[ratios.groupby(level="task").transform("size") >= LEAST_SEEDS]
+    if ratios.empty:
         raise TooLittle("Fewer than three seeds are recorded on both sides, without other work beside them.")
     interval = mean_interval(ratios)
-    return finding("calql", ratios, f"training with Cal-QL online (B) takes {np.exp(interval.value):.2f} times as long as with SAC (C)",
+    return finding("calql", ratios, f"training with Cal-QL online (B) takes {np.exp(interval.value):.2f} times as long as with SAC (C)"
+                   f"{task_by_task(ratios, lambda ratio: f'{np.exp(ratio):.2f}')}",
                    times(interval), judged(interval, float(np.log(1.25))))
 
 
@@ -107,10 +109,12 @@ def _() -> Finding:
 
 @measures("A pre-trained BeT actor outperforms a randomly initialised GPT actor")
 def _() -> Finding:
-    """E and D come from two sweeps with the same budget, seeds and test episodes."""
-    bet = by_seed(recorded("leaderboard")[0], "calql", "decorated_success")
-    gpt = by_seed(recorded("calql")[0], "calql_d", "decorated_success")
-    return replace(set_against("calql", bet, gpt, ("BeT (E)", "GPT (D)")), command=BOTH)
+    """On Door E and D come from two sweeps with the same budget, seeds and test episodes."""
+    setups, _ = recorded("calql")
+    both = pd.concat([recorded("leaderboard")[0].query("task == 'Door'"), setups])
+    bet, gpt = by_seed(both, "calql", "decorated_success"), by_seed(setups, "calql_d", "decorated_success")
+    found = set_against("calql", bet, gpt, ("BeT (E)", "GPT (D)"))
+    return replace(found, command="; ".join([found.command] + ["pdkit sweep data/sweeps/leaderboard.toml"] * ("Door" in found.tasks)))
 
 
 # ---- the architecture of the critic (appendix F.5.1) -------------------------------------------------------------------
@@ -124,7 +128,7 @@ def _gain(recipe: str) -> tuple[Interval, pd.Series]:
 def _largest_gain(method: str, kinds: Sequence[str]) -> tuple[Interval, pd.Series, str]:
     """That of the architecture with the largest mean; and all of them in words."""
     found = {kind: _gain(f"{method},critic_backbone={kind}") for kind in kinds}
-    told = ", ".join(f"{kind} {signed(interval.value)}" for kind, (interval, _) in found.items())
+    told = ", ".join(f"{kind} {signed(interval.value)}{task_by_task(values, signed)}" for kind, (interval, values) in found.items())
     interval, values = max(found.values(), key=lambda gain: gain[0].value)
     return interval, values, f"points gained over the base policy: {told}"
 
@@ -211,12 +215,13 @@ def _() -> Finding:
 def _() -> Finding:
     """Massively: the temperature more than doubles, and more than twice as much as without a warm start; |Q| likewise (notebook 07)."""
     table, _ = recorded("warm_start")
-    rows = table.assign(recipe="x", task="Door")
+    rows = table.assign(recipe="x")
     rises = np.log2(by_seed(rows, "x", "runs.warm.temperature") / np.maximum(1.0, by_seed(rows, "x", "runs.vanilla.temperature")))
     q = np.log2(by_seed(rows, "x", "runs.warm.q") / by_seed(rows, "x", "runs.vanilla.q"))
     first, second = mean_interval(rises), mean_interval(q)
     return finding("warm_start", rises, f"temperature {2 ** first.value:.2f} times, mean |Q| {2 ** second.value:.1f} times what they are "
-                   "without a warm start", f"{2 ** first.low:.2f} to {2 ** first.high:.2f} and {2 ** second.low:.1f} to "
+                   f"without a warm start{task_by_task(rises, lambda rise: f'{2 ** rise:.2f}')}",
+                   f"{2 ** first.low:.2f} to {2 ** first.high:.2f} and {2 ** second.low:.1f} to "
                    f"{2 ** second.high:.1f} times ({METHOD})",
                    jointly(judged(first, 1.0), judged(second, 1.0)))
 
@@ -237,8 +242,8 @@ def _() -> Finding:
     plain, warm = both["vanilla"], both["warm-fixed"]
     told_apart(plain, warm)
     interval, values = difference(plain, warm)
-    told = (f"mean success at equal numbers of the actor's updates: without {percent(plain.mean())}, with a warm start and a fixed "
-            f"temperature {percent(warm.mean())}: {signed(interval.value)} points")
+    told = (f"mean success at equal numbers of the actor's updates: without {percent(average(plain))}, with a warm start and a fixed "
+            f"temperature {percent(average(warm))}: {signed(interval.value)} points{task_by_task(values, signed)}")
     return finding("warm_finetuning", values, told, points(interval), judged(interval))
 
 
@@ -246,10 +251,11 @@ def _() -> Finding:
 def _() -> Finding:
     """Unstable: mean |Q| leaves what rewards alone can be worth (ours; the paper shows the critic's loss)."""
     table, _ = recorded("warm_start")
-    rows = table.assign(recipe="x", task="Door")
+    rows = table.assign(recipe="x")
     ratio = np.log(by_seed(rows, "x", "runs.fixed.q") / by_seed(rows, "x", "rewards_alone"))
     interval = mean_interval(ratio)
-    return finding("warm_start", ratio, f"largest mean |Q| {np.exp(interval.value):.1f} times the largest worth of rewards",
+    return finding("warm_start", ratio, f"largest mean |Q| {np.exp(interval.value):.1f} times the largest worth of rewards"
+                   f"{task_by_task(ratio, lambda r: f'{np.exp(r):.1f}')}",
                    times(interval, 1), judged(interval))
 
 
@@ -261,7 +267,8 @@ def _() -> Finding:
     rows = by_fraction(recorded("horizon")[0])
     whole, short = end_gains(rows)
     interval, values = difference(short, whole)
-    told = {method: ", ".join(f"{f:g}: {signed(part.gain.mean())}" for f, part in mine.groupby("start_fraction"))
+    told = {method: ", ".join(f"{f:g}: {signed(average(gains))}{task_by_task(gains, signed)}" for f, gains in (
+        (f, part.set_index(["task", "seed"]).gain) for f, part in mine.groupby("start_fraction")))
             for method, mine in rows.groupby("method")}
     beside = f"; the decorator: {told['policy_decorator']}" if "policy_decorator" in told else ""
     return finding("horizon", values, "points gained over the base policy, by the share of the way that lies behind: SAC fine-tuning "
@@ -274,7 +281,7 @@ def _numbered(prefix: str) -> tuple[pd.DataFrame, dict[float, str]]:
     columns = {float(name.removeprefix(prefix)): name for name in table if name.startswith(prefix)}
     if len(columns) < 2:
         raise TooLittle(f"Fewer than two columns {prefix}NUMBER are recorded.")
-    return table.assign(recipe="x", task="Door"), dict(sorted(columns.items()))
+    return table.assign(recipe="x"), dict(sorted(columns.items()))
 
 
 @measures("With a longer horizon, random exploration")

@@ -290,7 +290,7 @@ def _extremely_poor(features: str) -> Finding:
     """Extremely poorly: below half of the BeT's success on the same demonstrations and episodes (ours, one yardstick for all features). The
     k and buffer with the largest mean count, so that no bad choice of ours makes the claim true."""
     table, _ = recorded("vinn")
-    rows = table.assign(recipe="x", task="Door")
+    rows = table.assign(recipe="x")
     tried = {name: rows[name].mean() for name in rows if name.startswith(f"vinn.{features},") and name.endswith(".value")}
     if not tried:
         raise TooLittle(f"No lookup by {features} features is recorded.")

@@ -39,6 +39,6 @@ def updated(claims: pd.DataFrame) -> pd.DataFrame:
 
 
 def shown(claims: pd.DataFrame, *sections: str) -> pd.DataFrame:
-    """For a notebook: the claims of these sections (such as "E.1") with verdict, what was measured and its interval."""
+    """For a notebook: the claims of these sections (such as "E.1") with verdict, what was measured, its interval, and on which tasks."""
     chosen = claims[claims.section.map(lambda text: bool(set(text.split(", ")) & set(sections)))]
-    return updated(chosen)[["section", "claim", "verdict", "measured", "interval", "seeds"]].reset_index(drop=True)
+    return updated(chosen)[["section", "claim", "verdict", "measured", "interval", "tasks", "seeds"]].reset_index(drop=True)
