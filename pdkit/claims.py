@@ -10,8 +10,9 @@ Every verdict follows one of few rules, so that no one is tempted to choose the 
 - a claim of several parts is **reproduced** when all are, **not** when none is and one is "not", else **partly**; a statement with
   several conditions (such as "works") has the weakest verdict among them;
 - runs of several tasks, from one record or from those of a comparison on Door and on others (recorded.record_of), are judged by the mean
-  over the tasks, and each task's own mean is told beside it;
-- where the claim is about more tasks than were run, "reproduced" counts as **partly**;
+  over the tasks; where their own means lie on different sides the verdict is **partly**, whatever the mean;
+- where the claim names tasks, those of them that are recorded are judged alone, and the others told beside them; where it names more
+  than were run, "reproduced" counts as **partly**;
 - fewer than three seeds are no test, and neither are two sides that both solve hardly anything: the budget does not tell them apart.
 """
 from __future__ import annotations
@@ -117,6 +118,24 @@ def judged(interval: Interval, enough: float = 0.0) -> str:
     if interval.low > enough:
         return "reproduced"
     return "not" if interval.value <= enough or interval.high < enough else "partly"
+
+
+def judged_over_tasks(values: pd.Series, enough: float = 0.0) -> str:
+    """The rule above for values by (task, seed): that of their mean over tasks, where the tasks' own means lie on one side."""
+    above = values.groupby(level="task").mean() > enough
+    return judged(mean_interval(values), enough) if above.all() or not above.any() else "partly"
+
+
+def on_tasks(values: pd.Series, tasks: Sequence[str]) -> pd.Series:
+    """The values, by (task, seed), of some tasks."""
+    return values[values.index.get_level_values("task").isin(tasks)]
+
+
+def named_by(paper: Sequence[str], values: pd.Series) -> tuple[pd.Series, pd.Series]:
+    """Of values by (task, seed) those to judge, on tasks that the claim names (all, where it names none of them), and the others."""
+    tasks = set(values.index.get_level_values("task"))
+    chosen = tasks & set(paper) or tasks
+    return on_tasks(values, chosen), on_tasks(values, tasks - chosen)
 
 
 def weakest(*verdicts: str) -> str:
@@ -225,11 +244,12 @@ def set_against(record: str | Sequence[str], one: pd.Series, two: pd.Series, nam
                 paper: Sequence[str] = ()) -> Finding:
     """The same for runs by (task, seed), from wherever; `names` says what both are called."""
     told_apart(one, two)
-    one, two = matched(one, two)
-    interval, values = difference(one, two)
+    values, others = named_by(paper, difference(*matched(one, two))[1])
+    interval, one, two = mean_interval(values), one.loc[values.index], two.loc[values.index]
+    beside = ", ".join(f"{task} {signed(mean)}" for task, mean in others.groupby(level="task").mean().items())
     told = (f"{names[0]} {percent(average(one))}, {names[1]} {percent(average(two))}: {signed(interval.value)} points"
-            f"{task_by_task(values, signed)}")
-    return finding(record, values, told, points(interval), judged(interval if sign > 0 else turned(interval), enough), paper)
+            f"{task_by_task(values, signed)}{f'; not judged: {beside}' if beside else ''}")
+    return finding(record, values, told, points(interval), judged_over_tasks(sign * values, enough), paper)
 
 
 def ahead(record: str | Sequence[str], table: pd.DataFrame, own: str, kinds: Mapping[str, Sequence[str]], paper: Sequence[str],
@@ -244,7 +264,7 @@ def ahead(record: str | Sequence[str], table: pd.DataFrame, own: str, kinds: Map
     interval, values, _ = min(leads, key=lambda lead: lead[0].value)
     told = f"{percent(average(mine.loc[values.index]))}: " + ", ".join(lead[2] for lead in leads) + beside
     return finding(record, values, told, points(interval),
-                   weakest(*(judged(lead[0]) for lead in leads)), paper)
+                   weakest(*(judged_over_tasks(lead[1]) for lead in leads)), paper)
 
 
 def finding(record: str | Sequence[str], values: pd.Series, measured: str, interval: str, verdict: str, paper: Sequence[str] = ()
@@ -258,7 +278,7 @@ def finding(record: str | Sequence[str], values: pd.Series, measured: str, inter
     records = [part for name in ([record] if isinstance(record, str) else record) for part, (table, _) in _records(name).items()
                if set(table.task) & set(tasks)]
     made = [command for part in records for command in commands(part, tasks)]
-    return Finding(" ".join(tasks), seeds, measured, interval, verdict, "; ".join(made))
+    return Finding(" ".join(tasks), seeds, measured, interval, verdict, "; ".join(dict.fromkeys(made)))
 
 
 def commands(record: str, tasks: Sequence[str]) -> list[str]:
@@ -292,7 +312,9 @@ def _records(name: str) -> dict[str, tuple[pd.DataFrame, pd.DataFrame]]:
         except PdkitError as error:
             missing.append(error)
             continue
-        found[part] = table.assign(task=table.task.where(~table.task.astype(str).str.match(r"\d"), "Door")), curves
+        if part == name:
+            table["task"] = table.task.where(~table.task.astype(str).str.match(r"\d"), "Door")
+        found[part] = table, curves
     if not found:
         raise TooLittle(str(missing[0])) from None
     return found

@@ -108,7 +108,7 @@ def test(argv: list[str]) -> int:
     import pytest
 
     os.chdir(ROOT)
-    serial = re.compile(r"-n|--numprocesses|--pdb|--trace|--capture=no|-[a-z]*s$|(-p)?no:xdist")  # by arguments, -vs among them
+    serial = re.compile(r"-[vqxl]*n|--numprocesses|--pdb|--trace|--capture|-[vqxl]*s[vqxl]*$|(-p)?no:xdist")  # -sv, too
     alone = any(os.path.exists(a.split("::")[0]) or serial.match(a) for a in argv) or not find_spec("xdist")
     workers = min(4, cores())
     return int(pytest.main(argv if alone or workers < 2 else ["-n", str(workers), "--dist", "worksteal", *argv]))

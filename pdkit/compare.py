@@ -195,9 +195,11 @@ def budgets(table: pd.DataFrame, labels: Mapping[str, str]) -> pd.DataFrame:
 
 def start_name(method: str, task: str) -> str:
     """What the policy is called that the comparisons give to a method: the method's own (pdkit/methods/registry.py), but where that is the
-    task's base policy that of DECORATED. A method from scratch is given one, too: Cal-QL's setups A to C learn from its episodes."""
+    task's base policy that of DECORATED. Of the methods from scratch that holds for Cal-QL's setups A to C, which learn from its episodes;
+    to the others it is a yardstick alone."""
     name = get_method(method).base
-    return DECORATED.get(task, name) if name == "base" else name
+    uses = not from_scratch(method) or method.startswith("calql")
+    return DECORATED.get(task, name) if name == "base" and uses else name
 
 
 def start_of(method: str, task: str) -> Path:

@@ -19,7 +19,7 @@ import pandas as pd
 import torch
 import torch.nn.functional as F
 
-from .claims import TooLittle, by_seed, difference, judged, mean_interval, turned, weakest
+from .claims import TooLittle, by_seed, difference, judged_over_tasks, matched, weakest
 from .errors import PdkitError, unknown
 from .evaluate import Actor
 from .rl.networks import Critics
@@ -154,13 +154,14 @@ def by_fraction(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def end_gains(table: pd.DataFrame, method: str = "sac_finetune") -> tuple[pd.Series, pd.Series]:
-    """Gains of `by_fraction` rows of one method by (task, seed): on the whole task, and from the latest start. Raises TooLittle."""
+    """Gains of `by_fraction` rows of one method by (task, seed), of runs that have both: on the whole task, and from the latest start.
+    Raises TooLittle."""
     rows = table[table.method == method]
     ends = rows.start_fraction.min(), rows.start_fraction.max()
     if rows.empty or ends[0] == ends[1]:
         raise TooLittle(f"Fewer than two horizons of {method} are recorded.")
     whole, short = (by_seed(rows[rows.start_fraction == end].assign(recipe=method), method, "gain") for end in ends)
-    return whole, short
+    return matched(whole, short)
 
 
 # ---- verdicts --------------------------------------------------------------------------------------------------------
@@ -210,10 +211,10 @@ def failure_verdict(table: pd.DataFrame, method: str = "sac_finetune") -> tuple[
             for f, part in table[table.method == method].groupby("start_fraction")]
     try:
         whole, short = end_gains(table, method)
-        interval, _ = difference(short, whole)
+        interval, values = difference(short, whole)
     except TooLittle:
         return "untested", said
     said.append(f"latest start less the whole task: {100 * interval.value:+.0f} points ({100 * interval.low:+.0f} to "
                 f"{100 * interval.high:+.0f})")
-    fails, fails_short = (judged(turned(mean_interval(gains))) == "reproduced" for gains in (whole, short))
-    return weakest(judged(interval), "reproduced" if fails and not fails_short else "partly"), said
+    fails, fails_short = (judged_over_tasks(-gains.loc[values.index]) == "reproduced" for gains in (whole, short))
+    return weakest(judged_over_tasks(values), "reproduced" if fails and not fails_short else "partly"), said

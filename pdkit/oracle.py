@@ -1,9 +1,9 @@
 """What a bound allows: a demonstrator corrects the base policy as far as the bound lets it, with nothing to be learned.
 
-    executed action   a = a_base(o) + clip(a_demonstrator(o) - a_base(o), -alpha s, alpha s),   s the task's alpha_scale
+    executed action   a = clip(a_base(o) + clip(a_demonstrator(o) - a_base(o), -alpha s, alpha s), -1, 1),   s the task's alpha_scale
 
 The demonstrator is the task's scripted expert, or else the agent that made the demonstrations. Where this succeeds and the decorator does
-not, the bound is not what holds it back; where it fails, a better correction inside the bound may still exist, since the
+not, the bound leaves room for better corrections; where it fails, a better correction inside the bound may still exist, since the
 demonstrator does not know what the base does next. It may know more than a residual policy, though: some scripted experts remember what
 they did before, and that of TurnFaucet looks into the simulation.
 """

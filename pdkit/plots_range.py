@@ -63,8 +63,9 @@ def bounds_figure(table: pd.DataFrame, reached: pd.DataFrame | None = None, titl
     ticks = sorted(set.intersection(*(set(table.alpha[table.task == task]) for task in tasks)))  # a task's own bound would crowd them
     for ax, task in zip(axes.flat, tasks, strict=False):
         rows = table[table.task == task].sort_values("alpha")
-        ax.fill_between(rows.alpha, rows.low, rows.high, color=COLORS["base"], alpha=0.2, lw=0)
-        ax.plot(rows.alpha, rows.success, "-o", ms=4, color=COLORS["base"])
+        for _, line in rows.groupby("policy") if "policy" in rows else [("", rows)]:
+            ax.fill_between(line.alpha, line.low, line.high, color=COLORS["base"], alpha=0.2, lw=0)
+            ax.plot(line.alpha, line.success, "-o", ms=4, color=COLORS["base"])
         for row in reached[reached.task == task].itertuples() if reached is not None else ():
             ax.plot(row.alpha, row.success, "D", ms=6, color=COLORS["decorated"])
         ax.set_xscale("symlog", linthresh=least)  # 0, the base policy alone, stands on it too

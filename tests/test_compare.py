@@ -185,6 +185,11 @@ def test_a_bound_works_where_it_helps_and_hardly_any_is_better(near, best, base,
 
 # ---- a run of one's own ----------------------------------------------------------------------------------------------
 
+def test_what_learns_from_scratch_is_measured_against_the_base_policy():
+    """As its recorded runs are (data/sweeps/leaderboard_stackcube.toml)."""
+    assert compare.start_of("sac_from_scratch", "StackCube").name == "base"
+
+
 def test_comparisons_start_from_a_behavior_transformer():
     folders = {(method, task): compare.start_of(method, task).relative_to(DATA / "checkpoints").as_posix() for method, task in (
         ("policy_decorator", "Door"), ("policy_decorator", "StackCube"), ("sac_finetune", "StackCube"), ("calql_a", "StackCube"),

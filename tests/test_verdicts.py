@@ -277,7 +277,7 @@ def test_a_finding_names_the_sweeps_that_made_its_rows(results):
     other = runs("ppo_decorator", [0.9] * 3, task="Pen").assign(sweep="pdkit sweep other.toml")
     write(results, "leaderboard", table, other)
     assert claims.commands("leaderboard", ["Pen"]) == ["pdkit sweep other.toml"]
-    assert verdicts.find("Policy Decorator with PPO in place of SAC improves the base policy.").command.count("pdkit sweep") == 2
+    assert claims.compared("leaderboard", "ppo_decorator", second_column="base_success").command.count("pdkit sweep") == 2
 
 
 def test_the_record_of_another_task_is_judged_with_doors(results):
@@ -298,6 +298,37 @@ def test_the_record_of_another_task_is_judged_with_doors(results):
     (results / "ablations.csv").unlink()
     write(results, "ablations_stackcube", *cube)
     assert verdicts.find(claim).tasks == "StackCube"
+
+
+def test_of_the_tasks_that_a_claim_names_those_recorded_are_judged_alone(results):
+    """E.2 is about StackCube: what Door shows is told beside it, and judged only while StackCube is not recorded."""
+    claim = "A critic that sees the sum of base and residual action does better than one that sees both side by side."
+    write(results, "ablations", runs(ablations.GRID, [0.9, 0.91, 0.92]), runs("critic_input=concat", [0.5] * 3))
+    assert verdicts.find(claim).verdict == "partly"
+    write(results, "ablations_stackcube", runs(ablations.GRID, [0.5, 0.51, 0.52], task="StackCube"),
+          runs("critic_input=concat", [0.6] * 3, task="StackCube"))
+    found = verdicts.find(claim)
+    assert (found.verdict, found.tasks) == ("not", "StackCube") and "-9.0 points; not judged: Door +41.0" in found.measured
+    assert found.command == "pdkit sweep data/sweeps/ablations_stackcube.toml"
+
+
+def test_tasks_that_contradict_each_other_are_no_verdict_on_their_mean():
+    index = pd.MultiIndex.from_product([["Door", "StackCube"], range(3)], names=["task", "seed"])
+    values = pd.Series([0.5, 0.51, 0.52, -0.1, -0.11, -0.12], index)
+    assert claims.judged(claims.mean_interval(values)) == "reproduced"
+    assert claims.judged_over_tasks(values) == claims.judged_over_tasks(-values) == "partly"
+    assert claims.judged_over_tasks(values, 0.6) == "not" and claims.judged_over_tasks(values, -0.2) == "reproduced"
+
+
+def test_a_sweep_halfway_through_changes_no_verdict(results):
+    """Only the whole task is recorded on StackCube yet, with two seeds elsewhere: the finding is Door's."""
+    claim = "A long task horizon is a key factor in the failure of fine-tuning baselines."
+    write(results, "horizon", *(runs(f"sac_finetune,start_fraction={f}", [end - 0.01, end, end + 0.01])
+                                for f, end in ((0.0, 0.1), (0.5, 0.4), (0.75, 0.49))))
+    door = verdicts.find(claim)
+    write(results, "horizon_stackcube", runs("sac_finetune,start_fraction=0.0", [1.0] * 3, task="StackCube"),
+          runs("sac_finetune,start_fraction=0.75", [0.0] * 2, task="StackCube"))
+    assert verdicts.find(claim) == door and door.verdict == "reproduced"
 
 
 def test_commands_that_differ_in_their_seed_are_one(results):

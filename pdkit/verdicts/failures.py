@@ -21,8 +21,10 @@ from ..claims import (
     finding,
     jointly,
     judged,
+    judged_over_tasks,
     matched,
     mean_interval,
+    on_tasks,
     percent,
     points,
     recorded,
@@ -49,11 +51,11 @@ def _() -> Finding:
         lambda recipe: by_seed(table, recipe, "decorated_success"), lambda recipe: efficiency(curves, recipe)))
     told_apart(*ends, *ways)
     ends, ways = matched(*ends), matched(*ways)
-    (end, values), (way, _) = difference(*ends), difference(*ways)
+    (end, values), (way, over) = difference(*ends), difference(*ways)
     at_end, on_the_way = (", ".join(percent(average(side)) for side in sides) for sides in (ends, ways))
     return finding("leaderboard", values, f"Cal-QL and SAC fine-tuning: at the end {at_end}; over all evaluations {on_the_way}",
                    f"at the end {points(end)}; over all evaluations {points(way)}",
-                   jointly(judged(turned(end), -0.1), judged(turned(way), -0.1)))
+                   jointly(judged_over_tasks(-values, -0.1), judged_over_tasks(-over, -0.1)))
 
 
 def _efficiency(first: str, second: str) -> tuple[Interval, pd.Series, str]:
@@ -71,18 +73,18 @@ def _efficiency(first: str, second: str) -> tuple[Interval, pd.Series, str]:
 def _() -> Finding:
     """A lot: A is ahead of B by more than 10 points (ours) of the mean success over the evaluations of the online stage."""
     interval, values, told = _efficiency("calql_a", "calql_b")
-    return finding("calql", values, f"A and B: {told}", points(interval), judged(interval, 0.1))
+    return finding("calql", values, f"A and B: {told}", points(interval), judged_over_tasks(values, 0.1))
 
 
 @measures("SAC in place of Cal-QL online costs slightly in sample efficiency")
 def _() -> Finding:
     """Slightly: less than 10 points (ours) of the mean success over the online evaluations; and C's last policies exceed 90 %."""
     interval, values, told = _efficiency("calql_b", "calql_c")
-    ends = by_seed(recorded("calql")[0], "calql_c", "decorated_success")
+    ends = by_seed(recorded("calql")[0], "calql_c", "decorated_success").loc[values.index]
     high = mean_interval(ends)
     return finding("calql", values, f"B and C: {told}; C ends at {percent(average(ends))}{task_by_task(ends, percent)}",
                    f"cost {points(interval)}; C {percent(high.low)} to {percent(high.high)}",
-                   jointly(judged(turned(interval), -0.1), judged(high, 0.9)))
+                   jointly(judged_over_tasks(-values, -0.1), judged_over_tasks(ends, 0.9)))
 
 
 @measures("SAC in place of Cal-QL online saves significant wall-clock time")
@@ -99,7 +101,7 @@ def _() -> Finding:
     interval = mean_interval(ratios)
     return finding("calql", ratios, f"training with Cal-QL online (B) takes {np.exp(interval.value):.2f} times as long as with SAC (C)"
                    f"{task_by_task(ratios, lambda ratio: f'{np.exp(ratio):.2f}')}",
-                   times(interval), judged(interval, float(np.log(1.25))))
+                   times(interval), judged_over_tasks(ratios, float(np.log(1.25))))
 
 
 @measures("A large GPT actor does worse than a small MLP actor")
@@ -119,15 +121,19 @@ def _() -> Finding:
 
 # ---- the architecture of the critic (appendix F.5.1) -------------------------------------------------------------------
 
-def _gain(recipe: str) -> tuple[Interval, pd.Series]:
+def _gain(recipe: str) -> pd.Series:
     """What runs of this architecture gain over the policy that they started from."""
     table, _ = recorded("q_architectures")
-    return difference(by_seed(table, recipe, "decorated_success"), by_seed(table, recipe, "base_success"))
+    return difference(by_seed(table, recipe, "decorated_success"), by_seed(table, recipe, "base_success"))[1]
 
 
 def _largest_gain(method: str, kinds: Sequence[str]) -> tuple[Interval, pd.Series, str]:
-    """That of the architecture with the largest mean; and all of them in words."""
-    found = {kind: _gain(f"{method},critic_backbone={kind}") for kind in kinds}
+    """That of the architecture with the largest mean, over the tasks on which all of them are recorded; and all of them in words."""
+    gains = {kind: _gain(f"{method},critic_backbone={kind}") for kind in kinds}
+    common = set.intersection(*(set(values.index.get_level_values("task")) for values in gains.values()))
+    if not common:
+        raise TooLittle("No task has all architectures.")
+    found = {kind: (mean_interval(own), own) for kind, own in ((kind, on_tasks(values, common)) for kind, values in gains.items())}
     told = ", ".join(f"{kind} {signed(interval.value)}{task_by_task(values, signed)}" for kind, (interval, values) in found.items())
     interval, values = max(found.values(), key=lambda gain: gain[0].value)
     return interval, values, f"points gained over the base policy: {told}"
@@ -137,7 +143,7 @@ def _largest_gain(method: str, kinds: Sequence[str]) -> tuple[Interval, pd.Serie
 def _() -> Finding:
     """Slightly: above 0; a mean gain of more than 20 points (ours) is more than the claim says, and counts as partly."""
     interval, values, told = _largest_gain("sac_finetune", ["mlp"])
-    verdict = judged(interval)
+    verdict = judged_over_tasks(values)
     return finding("q_architectures", values, told, points(interval),
                    "partly" if verdict == "reproduced" and interval.value > 0.2 else verdict)
 
@@ -146,14 +152,14 @@ def _() -> Finding:
 def _() -> Finding:
     """No improvement: even the larger of the two gains stays below 5 points (ours)."""
     interval, values, told = _largest_gain("sac_finetune", ["shared", "separate"])
-    return finding("q_architectures", values, told, f"the larger one: {points(interval)}", judged(turned(interval), -0.05))
+    return finding("q_architectures", values, told, f"the larger one: {points(interval)}", judged_over_tasks(-values, -0.05))
 
 
 @measures("PPO fine-tuning performs poorly with all three")
 def _() -> Finding:
     """Poorly: even the best of the three ends below the base policy."""
     interval, values, told = _largest_gain("ppo_finetune", ["mlp", "shared", "separate"])
-    return finding("q_architectures", values, told, f"the best one: {points(interval)}", judged(turned(interval)))
+    return finding("q_architectures", values, told, f"the best one: {points(interval)}", judged_over_tasks(-values))
 
 
 # ---- notebooks run with several seeds (unlearning, warm start) ----------------------------------------------------------------
@@ -223,7 +229,7 @@ def _() -> Finding:
                    f"without a warm start{task_by_task(rises, lambda rise: f'{2 ** rise:.2f}')}",
                    f"{2 ** first.low:.2f} to {2 ** first.high:.2f} and {2 ** second.low:.1f} to "
                    f"{2 ** second.high:.1f} times ({METHOD})",
-                   jointly(judged(first, 1.0), judged(second, 1.0)))
+                   jointly(judged_over_tasks(rises, 1.0), judged_over_tasks(q, 1.0)))
 
 
 WARM_UPDATES = 625  # of data/sweeps/warm_finetuning.toml: the distance of two evaluations, so that both arms meet at equal ages
@@ -239,12 +245,12 @@ def _() -> Finding:
         moved = rows[rows.updates > waits].assign(age=(rows.updates - waits) // 100)
         arms[recipe] = moved.set_index(["task", "seed", "age"]).success_once
     both = pd.concat(arms, axis=1, join="inner").groupby(["task", "seed"]).mean()
-    plain, warm = both["vanilla"], both["warm-fixed"]
+    interval, values = difference(both["vanilla"], both["warm-fixed"])
+    plain, warm = both["vanilla"].loc[values.index], both["warm-fixed"].loc[values.index]
     told_apart(plain, warm)
-    interval, values = difference(plain, warm)
     told = (f"mean success at equal numbers of the actor's updates: without {percent(average(plain))}, with a warm start and a fixed "
             f"temperature {percent(average(warm))}: {signed(interval.value)} points{task_by_task(values, signed)}")
-    return finding("warm_finetuning", values, told, points(interval), judged(interval))
+    return finding("warm_finetuning", values, told, points(interval), judged_over_tasks(values))
 
 
 @measures("With a warm start and a fixed entropy coefficient, the training of the critic is very unstable")
@@ -256,7 +262,7 @@ def _() -> Finding:
     interval = mean_interval(ratio)
     return finding("warm_start", ratio, f"largest mean |Q| {np.exp(interval.value):.1f} times the largest worth of rewards"
                    f"{task_by_task(ratio, lambda r: f'{np.exp(r):.1f}')}",
-                   times(interval, 1), judged(interval))
+                   times(interval, 1), judged_over_tasks(ratio))
 
 
 # ---- the horizon (F.1, F.4; notebook 10) -------------------------------------------------------------------------------
@@ -267,8 +273,9 @@ def _() -> Finding:
     rows = by_fraction(recorded("horizon")[0])
     whole, short = end_gains(rows)
     interval, values = difference(short, whole)
+    judged_on = set(values.index.get_level_values("task"))
     told = {method: ", ".join(f"{f:g}: {signed(average(gains))}{task_by_task(gains, signed)}" for f, gains in (
-        (f, part.set_index(["task", "seed"]).gain) for f, part in mine.groupby("start_fraction")))
+        (f, on_tasks(part.set_index(["task", "seed"]).gain, judged_on)) for f, part in mine.groupby("start_fraction")))
             for method, mine in rows.groupby("method")}
     beside = f"; the decorator: {told['policy_decorator']}" if "policy_decorator" in told else ""
     return finding("horizon", values, "points gained over the base policy, by the share of the way that lies behind: SAC fine-tuning "
@@ -290,9 +297,9 @@ def _() -> Finding:
     rows, rates = _numbered("met.random actions.")
     whole, late = (by_seed(rows, "x", rates[end]) for end in (min(rates), max(rates)))
     interval, values = difference(late, whole)
-    told = ", ".join(f"{f:g}: {percent(rows[name].mean())}" for f, name in rates.items())
+    told = ", ".join(f"{f:g}: {percent(average(by_seed(rows, 'x', name)))}" for f, name in rates.items())
     return finding("exploration", values, f"episodes with a reward under random actions, by the share of the way that lies behind: {told}",
-                   f"latest less whole: {points(interval)}", judged(interval))
+                   f"latest less whole: {points(interval)}", judged_over_tasks(values))
 
 
 @measures("With a longer horizon, the sparse reward takes longer")

@@ -29,6 +29,7 @@ from ..claims import (
     first_evaluation,
     jointly,
     judged,
+    judged_over_tasks,
     matched,
     mean_interval,
     not_counted,
@@ -163,7 +164,7 @@ def _jerk(recipe: str, limit: float, sign: int) -> Finding:
     interval = mean_interval(ratios)
     told = task_by_task(ratios, lambda ratio: f"{np.exp(ratio):.2f}")
     return finding("leaderboard", ratios, f"mean jerk of {recipe} {np.exp(interval.value):.2f} times the base policy's{told}",
-                   times(interval), judged(interval if sign > 0 else turned(interval), sign * float(np.log(limit))))
+                   times(interval), judged_over_tasks(sign * ratios, sign * float(np.log(limit))))
 
 
 @measures("SAC from scratch reaches 0 %")
@@ -248,10 +249,11 @@ def _() -> Finding:
     start = by_seed(table, "residual_rl", "base_success")
     interval, values = difference(early, start)
     first = table.loc[table.recipe == "residual_rl", "first_reward_step"]
-    return finding("leaderboard", values, f"success in the first 5,000 steps {percent(average(early))} (base {percent(average(start))}), "
+    return finding("leaderboard", values, f"success in the first 5,000 steps {percent(average(early))} (base {percent(average(start))})"
+                   f"{task_by_task(early, percent)}, "
                    f"first reward after {first.median():,.0f} steps (median; {int(first.isna().sum())} of {len(first)} runs never)",
                    points(interval), "reproduced" if early.max() == 0 < start.min() else
-                   weakest("partly", judged(turned(interval), 0.2)))
+                   weakest("partly", judged_over_tasks(-values, 0.2)))
 
 
 @measures("Residual RL fails later")
@@ -266,7 +268,7 @@ def _() -> Finding:
     return finding("leaderboard", ratio, f"mean |residual| {np.exp(size.value):.2f} times mean |base action| in the last quarter"
                    f"{task_by_task(ratio, lambda each: f'{np.exp(each):.2f}')}; success {signed(success.value)} points against the base "
                    f"policy{task_by_task(gains, signed)}",
-                   f"{times(size)}; {points(success)}", jointly(judged(size), judged(turned(success))))
+                   f"{times(size)}; {points(success)}", jointly(judged_over_tasks(ratio), judged_over_tasks(-gains)))
 
 
 @measures("FISH fails mainly because")
@@ -291,14 +293,14 @@ def _extremely_poor(features: str) -> Finding:
     k and buffer with the largest mean count, so that no bad choice of ours makes the claim true."""
     table, _ = recorded("vinn")
     rows = table.assign(recipe="x")
-    tried = {name: rows[name].mean() for name in rows if name.startswith(f"vinn.{features},") and name.endswith(".value")}
+    tried = {name: average(by_seed(rows, "x", name)) for name in rows if name.startswith(f"vinn.{features},") and name.endswith(".value")}
     if not tried:
         raise TooLittle(f"No lookup by {features} features is recorded.")
     best_one = max(tried, key=lambda column: tried[column])
     vinn, bet = by_seed(rows, "x", best_one), by_seed(rows, "x", "bet.value")
     interval, values = difference(vinn, bet / 2)
     name = best_one.removeprefix("vinn.").removesuffix(".value")
-    return finding("vinn", values, f"{name}, the best of {len(tried)}, {percent(vinn.mean())}; BeT {percent(bet.mean())}",
+    return finding("vinn", values, f"{name}, the best of {len(tried)}, {percent(average(vinn))}; BeT {percent(average(bet))}",
                    f"VINN less half of BeT: {points(interval)}", judged(turned(interval)), EIGHT)
 
 

@@ -16,7 +16,7 @@ from ..claims import (
     difference,
     finding,
     jointly,
-    judged,
+    judged_over_tasks,
     matched,
     not_counted,
     percent,
@@ -69,8 +69,8 @@ def _() -> Finding:
     wide = "alpha=0.1,H=40000"
     own, ends = matched(by_seed(table, GRID, "decorated_success"), by_seed(table, wide, "decorated_success"))
     interval, values = difference(ends, own)
-    gain, _ = difference(ends, by_seed(table, wide, "base_success"))
-    verdict = weakest(judged(interval, -0.1), judged(gain), "partly")
+    gain, gains = difference(ends, by_seed(table, wide, "base_success"))
+    verdict = weakest(judged_over_tasks(values, -0.1), judged_over_tasks(gains), "partly")
     return finding("ablations", values, f"H=40000 (all of the training) {percent(average(ends))}, H=20000 {percent(average(own))}: "
                    f"{signed(interval.value)} points{task_by_task(values, signed)}; {signed(gain.value)} over the base policy",
                    points(interval), verdict)
