@@ -34,10 +34,10 @@ ENOUGH = 3  # seeds below which the interval is the test episodes' alone
 
 
 def over_bets(jobs: pd.DataFrame, bets: pd.DataFrame) -> pd.DataFrame:
-    """Rows of main_job.csv, but on the tasks of which bet_bases.csv has ENOUGH seeds that one's."""
+    """Rows of main_job.csv, but on the tasks of which bet_bases.csv has ENOUGH seeds, or that it alone has, that one's."""
     if not len(bets):
         return jobs
-    known = bets[bets.groupby("task").seed.transform("nunique") >= ENOUGH]
+    known = bets[(bets.groupby("task").seed.transform("nunique") >= ENOUGH) | ~bets.task.isin(jobs.task)]
     return pd.concat([jobs[~jobs.task.isin(known.task)], known], ignore_index=True)
 
 
