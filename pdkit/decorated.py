@@ -14,6 +14,7 @@ from .errors import PdkitError
 from .files import atomic_folder, read_json, sha256, write_json
 from .policies import Policy, load_policy, save_policy
 from .rl.networks import Actor
+from .tasks.features import Sight
 
 FORMAT = "pdkit-decorated-1"
 
@@ -26,9 +27,9 @@ def flat_actions(base: Policy, windows: np.ndarray) -> np.ndarray:
 class Decorated:
     """Acts with a_base + alpha * tanh(mean residual): no gate, no sampling (facts.md 1.1, evaluation)."""
 
-    def __init__(self, base: Policy, actor: nn.Module, config: DecoratorConfig, normalize: bool = True):
+    def __init__(self, base: Policy, actor: nn.Module, config: DecoratorConfig, normalize: bool = True, features: str = ""):
         self.base, self.actor, self.config = base, actor, config
-        self.normalize = normalize  # whether the actor sees observations through the base policy's normaliser
+        self.sight = Sight(base.normalizer, normalize, features)  # what the actor sees of observations
         self.window, self.chunk = base.window, base.chunk
 
     def reset(self, seed: int) -> None:
@@ -41,8 +42,8 @@ class Decorated:
         base = flat_actions(self.base, windows)
         device = next(self.actor.parameters()).device
         obs = torch.from_numpy(np.ascontiguousarray(windows[:, -1], np.float32)).to(device)
-        features = actor_features(self.config, self.base.normalizer(obs) if self.normalize else obs, torch.from_numpy(base).to(device))
-        return base, self.actor.mean_action(features).cpu().numpy()
+        seen = actor_features(self.config, self.sight(obs), torch.from_numpy(base).to(device))
+        return base, self.actor.mean_action(seen).cpu().numpy()
 
     def act(self, windows: np.ndarray) -> np.ndarray:
         """Action chunks (N, chunk, act_dim) for windows (N, window, obs_dim); the environment clips them."""
@@ -58,8 +59,8 @@ def save_decorated(policy: Decorated, folder: str | Path, info: dict[str, Any] |
         save_policy(policy.base, temporary / "base")
         save_file({k: v.contiguous() for k, v in policy.actor.state_dict().items()}, temporary / "actor.safetensors")
         write_json(temporary / "decorated.json", {
-            "format": FORMAT, "decorator": asdict(policy.config), "actor": policy.actor.config, "normalize": policy.normalize,
-            "actor_sha256": sha256(temporary / "actor.safetensors"), "info": info or {}})
+            "format": FORMAT, "decorator": asdict(policy.config), "actor": policy.actor.config, "normalize": policy.sight.normalize,
+            "features": policy.sight.features, "actor_sha256": sha256(temporary / "actor.safetensors"), "info": info or {}})
 
 
 def load_decorated(folder: str | Path) -> Decorated:
@@ -80,4 +81,5 @@ def load_decorated(folder: str | Path) -> Decorated:
         config = DecoratorConfig(**card["decorator"] | {"alpha_scale": tuple(card["decorator"].get("alpha_scale", ()))})
     except (SafetensorError, RuntimeError, TypeError, KeyError) as error:
         raise PdkitError(f"{folder} does not hold the actor that its decorated.json describes; train it again.") from error
-    return Decorated(load_policy(folder / "base"), actor.eval(), config, bool(card["normalize"]))
+    return Decorated(load_policy(folder / "base"), actor.eval(), config, bool(card["normalize"]),
+                     str(card.get("features", "")))

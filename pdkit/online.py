@@ -30,6 +30,7 @@ from .runs import Run
 from .seeds import training_seed
 from .tasks import get_task
 from .tasks.batched import require_batched
+from .tasks.features import Sight
 from .tasks.horizon import horizon_spec, shortened
 from .tasks.spec import TaskSpec
 from .tasks.vector import Episode, VectorEnv
@@ -54,6 +55,9 @@ class Trainer:
         if base.config["obs_dim"] != self.spec.obs_dim or base.config["act_dim"] != self.spec.act_dim:
             raise PdkitError(f"This base policy is for {base.config['obs_dim']} observations and {base.config['act_dim']} actions; "
                              f"{self.spec.name} has {self.spec.obs_dim} and {self.spec.act_dim}.")
+        if config.features and not self.sees_features:
+            raise PdkitError(f"{config.method} makes networks of its own, which see no features; set features=False.")
+        self.sight = Sight(self.base.normalizer, config.normalize_obs, self.spec.name if config.features else "")
         torch.manual_seed(config.seed)
         self.rng = np.random.default_rng([config.seed, 1])
         self.generator = torch.Generator().manual_seed(config.seed)
@@ -95,12 +99,12 @@ class Trainer:
         while episodes last half a chunk or longer."""
         return min(self.config.total_steps, 2 * -(-self.config.total_steps // self.base.chunk))
 
+    sees_features = True  # whether the agent's networks see what `sight` shows
     chunks = True  # whether base policies may decide on several actions at once
 
     def _make_agent(self) -> SAC:
         c = self.config
-        return SAC(self.spec.obs_dim, self.act_dim, c.sac, c.decorator, device=c.device,
-                   normalize=self.base.normalizer if c.normalize_obs else None)
+        return SAC(self.spec.obs_dim + self.sight.more, self.act_dim, c.sac, c.decorator, device=c.device, normalize=self.sight)
 
     def _make_replay(self, capacity: int) -> Replay:
         return Replay(capacity, self.stored_dim, self.act_dim, device=self.config.device)
@@ -120,7 +124,7 @@ class Trainer:
 
     def _as_policy(self, actor: nn.Module, base: Policy) -> Decorated | Policy:
         """What is evaluated and reported: this actor as a policy."""
-        return Decorated(base, actor, self.config.decorator, normalize=self.config.normalize_obs)
+        return Decorated(base, actor, self.config.decorator, self.config.normalize_obs, self.sight.features)
 
     def save_policy(self, policy: Decorated | Policy, folder: Path) -> None:
         """Write a policy that `_as_policy` made."""

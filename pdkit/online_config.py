@@ -40,6 +40,7 @@ class OnlineConfig:
     success_tail: int = 20  # those that go on are cut, as by a time limit, this many steps after the first success; 0: not
     bootstrap: str = "truncated"  # value of s' at an episode's end: only at time limits, never, or always
     normalize_obs: bool = True  # networks see observations through the base policy's normaliser (the paper's code: raw)
+    features: bool = False  # networks see the task's features beside the observation (pdkit/tasks/features.py; ours, not the paper's)
     lr_decay_from: float = 0.4  # fraction of the run after which the learning rates of actor and critics fall linearly to a tenth
     eval_every: int = 7_500
     eval_episodes: int = 50  # on selection seeds

@@ -45,6 +45,7 @@ class OfflineFirst:
     """What both trainers below add to theirs: returns in every row, and the offline stage."""
 
     needs_demos = True
+    sees_features = False
 
     def __init__(self, config, base, demos=None, spec=None):
         own = config.method_config

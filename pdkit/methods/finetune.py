@@ -25,6 +25,7 @@ class FineTune(Trainer):
     """SAC on a `bet-sac` policy. RLPD (the paper's cut-down) is the same with half of each batch from demonstrations."""
 
     starts_from: type[Policy] = BeTForSAC  # the only kind of base policy that it can tune
+    sees_features = False
 
     def __init__(self, config, base, demos=None, spec=None):
         kind = self.starts_from.kind

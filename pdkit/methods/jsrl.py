@@ -138,7 +138,7 @@ class JSRL(Trainer):
 
     def _as_policy(self, actor, base):
         zero = Zero.instead_of(base, base.window).to(next(actor.parameters()).device)
-        return JumpStart(base, Decorated(zero, actor, self.config.decorator, normalize=self.config.normalize_obs))
+        return JumpStart(base, Decorated(zero, actor, self.config.decorator, self.config.normalize_obs, self.sight.features))
 
     def save_policy(self, policy, folder):
         save_jump_start(policy, folder, {"task": self.config.task, "seed": self.config.seed})

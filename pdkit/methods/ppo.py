@@ -34,6 +34,8 @@ from .finetune import FineTune
 class OnPolicy(Trainer):
     """Collects `ppo_rollout` decisions of every environment, learns from them, and forgets them."""
 
+    sees_features = False
+
     def __init__(self, config, base, demos=None, spec=None):
         m, rows = config.method_config, config.method_config.ppo_rollout * config.num_envs
         if rows * base.chunk >= config.total_steps or m.ppo_minibatches > rows:

@@ -24,6 +24,7 @@ class OTRewarded(Trainer):
     """Subclasses say in which features episodes and demonstrations are compared."""
 
     needs_demos = True
+    sees_features = False
     _phi: nn.Module | None = None  # the network in these features, if it is renewed
 
     def __init__(self, config, base, demos=None, spec=None):
