@@ -20,6 +20,7 @@ from pdkit.rl.calql import CalQL, Conservative, WithReturns
 from pdkit.rl.replay import Replay
 from pdkit.rl.sac import SACConfig
 from pdkit.runs import Run
+from pdkit.unlearning import set_spread
 
 SPEC = PROBES["reach"]
 SETUPS = ("calql_a", "calql_b", "calql_c", "calql_d", "calql")
@@ -253,10 +254,18 @@ def test_setup_d_knows_nothing_of_the_imitated_policy_but_its_normaliser(bet_sac
     assert actor.heads(torch.zeros(1, 12))[1].mean().item() == pytest.approx(-1.5, abs=0.2)
 
 
-@pytest.mark.parametrize(("method", "offline", "steps"), [("calql_a", 300, 2500), ("calql_c", 200, 3500)])
+@pytest.mark.parametrize(("method", "offline", "steps"), [("calql_a", 300, 2500), ("calql_b", 300, 2500), ("calql_c", 200, 3500)])
 def test_cal_ql_learns(method, offline, steps):
     _, policy = run(method, calql_offline_updates=offline, calql_rollouts=20, total_steps=steps, utd=0.5)
     assert success("reach", policy) > 0.9
+
+
+def test_cal_ql_mends_an_imitated_transformer(bet_sac):  # noqa: F811
+    """Setup E, the paper's baseline: from a policy that aims beside the goal, with the spread that small actors start with."""
+    beside = bet_sac.with_lora(0)
+    set_spread(beside, -1.5)
+    _, policy = run("calql", beside, lora=0, calql_offline_updates=100, total_steps=3000, utd=0.5)
+    assert success("reach", policy) > 0.7 > 0.3 > success("reach", beside)
 
 
 @pytest.mark.parametrize("method", ["calql_a", "calql"])

@@ -102,13 +102,14 @@ def test_every_method_has_a_configuration_in_every_profile(method):
     assert METHODS[method].source and METHODS[method].title
 
 
-def test_fine_tuning_learns_and_leaves_the_start_alone(bet_sac):
+@pytest.mark.parametrize("method", ["sac_finetune", "rlpd_paper"])
+def test_fine_tuning_learns_and_leaves_the_start_alone(bet_sac, method):
     """It starts with the spread that small actors start with: with its own, a quarter of that, one seed of six hardly meets a reward."""
     start = bet_sac.with_lora(0)
     set_spread(start, -1.5)
     before = {k: v.clone() for k, v in start.state_dict().items()}
-    trainer, policy = run("sac_finetune", start, total_steps=3000)
-    assert isinstance(trainer, FineTune) and trainer.demos is None
+    trainer, policy = run(method, start, reach_demos(), total_steps=3000)
+    assert isinstance(trainer, FineTune) and (trainer.demos is None) == (method == "sac_finetune")
     assert success("reach", policy) > success("reach", start) + 0.5
     assert all(torch.equal(v, before[k]) for k, v in start.state_dict().items())
 

@@ -60,6 +60,25 @@ def test_target_uses_reward_discount_minimum_and_entropy():
     assert torch.allclose(y, data["reward"] + 0.9 * values.min(0).values, atol=1e-5)
 
 
+def test_of_many_critics_the_target_takes_the_least_of_those_drawn():
+    """RLPD: two of ten, drawn for each update (facts.md 3.2)."""
+    agent, data, noise = make(num_critics=5, target_subset=2, entropy_backup=False), batch(), torch.randn(8, 2)
+    for p in agent.targets.parameters():
+        p.data.add_(0.3 * torch.randn_like(p))
+    residual, _ = agent.actor.sample(data["next_obs"], noise)
+    values = agent.targets(torch.cat([data["next_obs"], data["next_base"] + 0.3 * residual], -1))
+    for members in ([0, 3], [4, 1]):
+        y = agent.td_target(data, data["next_obs"], noise, torch.tensor(0.5), torch.tensor(members))
+        assert torch.allclose(y, data["reward"] + 0.9 * torch.minimum(*values[members]), atol=1e-5)
+        assert (y > data["reward"] + 0.9 * values.min(0).values + 1e-3).any()  # not the least of all
+    drawn, target = [], agent.td_target
+    agent.td_target = lambda *given: drawn.append(tuple(sorted(given[-1].tolist()))) or target(*given)
+    g = torch.Generator().manual_seed(0)
+    for _ in range(40):
+        agent.update(data, g)
+    assert {len(set(members)) for members in drawn} == {2} and len(set(drawn)) >= 8  # of ten pairs
+
+
 def test_target_is_the_reward_alone_where_discount_is_zero():
     agent, data = make(), batch(discount=0.0)
     assert torch.allclose(agent.td_target(data, data["next_obs"], torch.randn(8, 2), torch.tensor(1.0)), data["reward"])
@@ -108,6 +127,17 @@ def test_actor_takes_the_minimum_of_the_critics():
     for _ in range(300):
         agent._update_actor(data, data["obs"], 0.01 * torch.randn((64, 2), generator=g), torch.tensor(0.0))
     assert agent.actor.mean_action(data["obs"])[:, 0].abs().max() < 0.3
+
+
+def test_the_actor_may_climb_the_mean_of_the_critics():
+    """RLPD's: where the least of two is highest at 0, their mean is highest at +1."""
+    agent = make(actor_lr=3e-3, autotune=False, actor_value="mean")
+    agent.critics.forward = lambda x: torch.stack([x[:, 3], -x[:, 3] / 2])
+    data = batch(64) | {"base": torch.zeros(64, 2)}
+    g = torch.Generator().manual_seed(0)
+    for _ in range(300):
+        agent._update_actor(data, data["obs"], 0.01 * torch.randn((64, 2), generator=g), torch.tensor(0.0))
+    assert agent.actor.mean_action(data["obs"])[:, 0].min() > 0.8
 
 
 def test_the_penalty_pulls_residuals_towards_zero_and_only_as_far_as_the_critic_lets_it():

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from test_policies import line_demos
+from test_probes import success
 from worlds import clone, reach_demos
 
 from pdkit import train
@@ -41,6 +42,18 @@ def test_more_neighbours_are_weighted_by_the_softmax_of_minus_their_distances():
     assert act(lookup(k=2), 2.5) == pytest.approx([(far * 0.5 - near) / (far + near)])
     weights = np.exp(-np.array([0.5, 0.5, 2.5]))
     assert act(lookup(k=3), 0.5) == pytest.approx([weights @ [0.0, 0.5, -1.0] / weights.sum()])
+
+
+def test_it_solves_the_more_the_more_demonstrations_it_looks_up():
+    """The reach probe, where any start and goal may come: with 200 demonstrations some near neighbour goes there, with 5 hardly one."""
+    solved = {}
+    for count in (200, 5):
+        demos = reach_demos(count)
+        policy = VINN({"obs_dim": 4, "act_dim": 2})
+        policy.fit_statistics(demos.observations, demos.actions)
+        policy.remember(*Windows(demos, policy.window, True).all())
+        solved[count] = success("reach", policy)
+    assert solved[200] > 0.5 > 0.2 > solved[5]
 
 
 def test_a_large_library_is_looked_up_as_exactly_as_by_measuring_all_of_it():

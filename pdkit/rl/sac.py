@@ -5,6 +5,10 @@
     actor    mean (temperature * log pi(a_res | s) - min_i Q_i(s, compose(base, a_res))) + penalty * mean a_res^2
     temperature   -log_temperature * mean (log pi + target_entropy)
 
+With num_critics > 2 and target_subset = M this is the learner of RLPD (Ball et al., 2023; facts.md 3.2): the target takes the least of
+M critics drawn anew for each update, and with actor_value = "mean" the actor climbs the mean of all. Its high update-to-data ratio and
+symmetric sampling are the loop's (utd, demo_fraction; pdkit/methods).
+
 log pi is that of the unscaled residual: alpha does not enter the entropy. Plain SAC is the case base = 0, alpha = 1.
 """
 from __future__ import annotations
