@@ -56,7 +56,7 @@ class Trainer:
             raise PdkitError(f"This base policy is for {base.config['obs_dim']} observations and {base.config['act_dim']} actions; "
                              f"{self.spec.name} has {self.spec.obs_dim} and {self.spec.act_dim}.")
         if config.features and not self.sees_features:
-            raise PdkitError(f"{config.method} makes networks of its own, which see no features; set features=False.")
+            raise PdkitError(f"The networks of {config.method} see the observation alone; set features=False.")
         self.sight = Sight(self.base.normalizer, config.normalize_obs, self.spec.name if config.features else "")
         torch.manual_seed(config.seed)
         self.rng = np.random.default_rng([config.seed, 1])

@@ -62,8 +62,8 @@ _LESSON_TASK: dict[str, dict[str, Any]] = {
     # The base is off by 0.08, so Door's bound does; success on selection episodes still rose over the last 10,000 steps, 88 to 98 %.
     "Relocate": dict(alpha=0.1, H=20_000, total_steps=50_000, train_limit=120, eval_every=10_000),
     # The base policy presses the peg against the box, millimetres beside the hole: small pushes are enough, and it cannot bear larger
-    # ones. Networks that see raw poses alone do not learn them in this budget; critics see the residual alone, or they would take the
-    # base's own actions for the reason of success.
+    # ones. Networks that see raw poses alone did not learn them (without_features.toml); critics see the residual alone, or they would
+    # take the base's own actions for the reason of success.
     "PegInsertionSide": dict(alpha=0.06, H=15_000, total_steps=60_000, utd=0.35, gamma=0.98, critic_input="residual", features=True,
                              actor_lr=3e-4, critic_lr=3e-4, train_limit=150, eval_every=10_000, eval_episodes=40, on_success="terminate",
                              success_tail=0),

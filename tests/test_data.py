@@ -16,7 +16,6 @@ from pdkit.tasks import get_task
 ADROIT = ["Door", "Hammer", "Pen", "Relocate"]
 MANISKILL = ["PegInsertionSide", "PushChair", "StackCube", "TurnFaucet"]
 SHIPPED = dict.fromkeys(ADROIT, "agent") | dict.fromkeys(MANISKILL, "scripted")  # task: who made the demonstrations
-NOT_REPAIRED = ["PegInsertionSide", "PushChair"]  # decorated, they are no better than their bases: the README says so
 
 
 def test_every_bundled_file_has_the_recorded_checksum():
@@ -130,4 +129,4 @@ def test_the_shipped_policies_are_those_of_a_recorded_row(task):
     assert row.env_steps >= online_config(task, "lesson").total_steps
     assert table.base_success.nunique() == 1 and 0.2 <= row.base_success <= 0.8 and (table.episodes == 200).all()
     gains = table.decorated_success - table.base_success  # a single seed may gain less: TurnFaucet's last one 13.5 points
-    assert (gains.mean() > 0.15) == (gains > 0.1).all() == (task not in NOT_REPAIRED)
+    assert gains.mean() > 0.15 and (gains > 0.1).all()

@@ -6,13 +6,15 @@ from scipy.spatial.transform import Rotation
 
 from pdkit.decorated import load_decorated, save_decorated
 from pdkit.demos import sources
+from pdkit.demos.chair_expert import PushChairExpert
 from pdkit.demos.peg_expert import _Scene
 from pdkit.errors import PdkitError
 from pdkit.files import DATA
+from pdkit.methods import METHODS
 from pdkit.methods.registry import make_trainer, method_config
 from pdkit.policies import load_policy
 from pdkit.policies.base import Normalizer
-from pdkit.probes import PROBES, zero_base
+from pdkit.probes import PROBES, ProbeBase, zero_base
 from pdkit.profiles import online_config
 from pdkit.tasks import features
 from pdkit.tasks.features import FEATURES, Sight
@@ -91,7 +93,10 @@ def test_a_residual_learns_from_features_what_the_observation_hides(monkeypatch)
 def test_who_sees_features():
     """The lesson's decorator and residual RL on that task; not the paper's profile, and no method with networks of its own."""
     assert online_config(PEG, "lesson").features and not online_config(PEG, "paper").features and not online_config("Door").features
-    assert method_config("residual_rl", PEG).features and not method_config("ppo_decorator", PEG).features
+    sighted = {method for method in METHODS if method_config(method, PEG).features}
+    assert sighted == {"policy_decorator", "residual_rl", "sac_from_scratch", "rlpd", "jsrl"}
+    visual = ProbeBase(dict(obs_dim=300, act_dim=7, kind="visual", bias=[0.0] * 7))
+    assert not method_config("policy_decorator", PEG, policy=visual).features
     config = method_config("ppo_decorator", PEG, "smoke", features=True)
     with pytest.raises(PdkitError, match="set features=False"):
         make_trainer(config, load_policy(DATA / "checkpoints" / PEG / "base"))
@@ -99,6 +104,15 @@ def test_who_sees_features():
         make_trainer(online_config("Door", "smoke", features=True, demo_fraction=0.0), load_policy(DATA / "checkpoints" / "Door" / "base"))
     with pytest.raises(PdkitError, match="features must be of type bool"):
         online_config(PEG, features="yes")
+
+
+def test_the_way_round_the_chair_is_the_expert_s():
+    obs = sources.bundled("PushChair").observations[::37]
+    found = features.chair(torch.from_numpy(obs)).numpy()
+    base, chair, motion = (obs[:, part] for part in (PushChairExpert.BASE, PushChairExpert.CHAIR, PushChairExpert.MOTION))
+    around = (np.arctan2(*chair.T[::-1]) - np.arctan2(*(base - chair).T[::-1]) + np.pi) % (2 * np.pi) - np.pi
+    assert np.allclose(found[:, 12], around, atol=1e-3) and np.allclose(found[:, 14] * 0.5, np.linalg.norm(base - chair, axis=1), atol=1e-4)
+    assert np.allclose(np.linalg.norm(found[:, 8:10], axis=1) * 0.3, np.linalg.norm(motion, axis=1), atol=1e-4)
 
 
 def test_the_chair_is_seen_from_the_robot():

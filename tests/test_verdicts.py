@@ -274,12 +274,13 @@ def test_parts_and_conditions():
 
 @pytest.mark.parametrize(("minutes", "verdict"), [([20.0, 22.0, 21.0], "reproduced"), ([5.0, 5.2, 5.1], "not"), ([5.0, 12, 6], "partly")])
 def test_what_the_critics_of_rlpd_cost(results, minutes, verdict):
-    tables = [runs(recipe, [0.9] * 3, train_minutes=took) for recipe, took in (("rlpd", minutes), ("sac_from_scratch", [3.0, 3.0, 3.0]))]
+    tables = [runs(recipe, [0.9] * 3, train_minutes=took, load_average=2.0, cores=2)
+              for recipe, took in (("rlpd", minutes), ("sac_from_scratch", [3.0, 3.0, 3.0]))]
     write(results, "leaderboard", *tables)
     (claim,) = starting("The Q ensemble and the high update-to-data ratio of RLPD")
     found = verdicts.find(claim)
     assert found.verdict == verdict and found.measured.endswith("SAC from scratch 3.0")
-    write(results, "leaderboard", tables[0][:2], tables[1])
+    write(results, "leaderboard", tables[0].assign(load_average=[2.0, 2.0, 7.0]), tables[1])  # one beside other work
     assert verdicts.find(claim) is None
 
 

@@ -31,7 +31,8 @@ def method_config(method: str, task: str, profile: str = "lesson", seed: int = 0
     m = get_method(method)
     own = m.changes | {"lesson": m.lesson, "smoke": m.lesson, "paper": m.paper}.get(profile, {})
     over = policy_values(task, profile, policy.kind, policy.chunk) if policy is not None and trainer_of(method).chunks else {}
-    over |= {} if trainer_of(method).sees_features else {"features": False}
+    sees_state = policy is None or policy.config["obs_dim"] == get_task(task).obs_dim  # and not what an encoder makes of pictures
+    over |= {} if trainer_of(method).sees_features and sees_state else {"features": False}
     return online_config(task, profile, seed, **({"method": method} | over | own | changes))
 
 
