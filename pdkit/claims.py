@@ -150,6 +150,11 @@ def jointly(*verdicts: str) -> str:
     return weakest(*verdicts)
 
 
+def undisturbed(table: pd.DataFrame) -> pd.DataFrame:
+    """The runs whose minutes count: those beside other work (a load average of more than one above the cores) would compare that work."""
+    return table[table.load_average <= table.cores + 1]
+
+
 def told_apart(*sides: pd.Series) -> None:
     """Raises TooLittle when no side solves anything to speak of."""
     if max(average(side) for side in sides) < FLOOR:
@@ -283,7 +288,7 @@ def finding(record: str | Sequence[str], values: pd.Series, measured: str, inter
 
 def commands(record: str, tasks: Sequence[str]) -> list[str]:
     """What makes the rows of these tasks: the column `sweep` where it is recorded, else a sweep of that name, else the rows' commands."""
-    table, _ = _records(record)[record]
+    table, _ = load(record)
     mine, spec = table[table.task.isin(tasks)], DATA / "sweeps" / f"{record}.toml"
     known = mine.sweep.dropna() if "sweep" in mine else []
     if len(known) or spec.exists() or "command" not in mine:

@@ -91,7 +91,7 @@ def test_a_residual_learns_from_features_what_the_observation_hides(monkeypatch)
 
 
 def test_who_sees_features():
-    """The lesson's decorator and residual RL on that task; not the paper's profile, and no method with networks of its own."""
+    """In that task's lesson the methods with the loop's own networks, over policies told the state; never the paper's profile."""
     assert online_config(PEG, "lesson").features and not online_config(PEG, "paper").features and not online_config("Door").features
     sighted = {method for method in METHODS if method_config(method, PEG).features}
     assert sighted == {"policy_decorator", "residual_rl", "sac_from_scratch", "rlpd", "jsrl"}

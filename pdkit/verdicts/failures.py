@@ -8,7 +8,6 @@ import numpy as np
 import pandas as pd
 
 from ..claims import (
-    LEAST_SEEDS,
     METHOD,
     Finding,
     TooLittle,
@@ -34,6 +33,7 @@ from ..claims import (
     times,
     told_apart,
     turned,
+    undisturbed,
 )
 from ..horizon_analysis import by_fraction, end_gains, failure_verdict
 from ..stats import Interval
@@ -89,16 +89,9 @@ def _() -> Finding:
 
 @measures("SAC in place of Cal-QL online saves significant wall-clock time")
 def _() -> Finding:
-    """Significant: B's training takes more than 1.25 times as long as C's (ours), the offline stage that both share included. Minutes of
-    runs beside other work (a load average of more than one above the cores) would compare that work, and do not count.
-    """
-    table, _ = recorded("calql")
-    table = table[table.load_average <= table.cores + 1]
-    ratios = np.log(by_seed(table, "calql_b", "train_minutes") / by_seed(table, "calql_c", "train_minutes")).dropna()
-    ratios = ratios[ratios.groupby(level="task").transform("size") >= LEAST_SEEDS]
-    if ratios.empty:
-        raise TooLittle("Fewer than three seeds are recorded on both sides, without other work beside them.")
-    interval = mean_interval(ratios)
+    """Significant: B's training takes more than 1.25 times as long as C's (ours), the offline stage that both share included."""
+    table = undisturbed(recorded("calql")[0])
+    interval, ratios = difference(*(np.log(by_seed(table, recipe, "train_minutes")) for recipe in ("calql_b", "calql_c")))
     return finding("calql", ratios, f"training with Cal-QL online (B) takes {np.exp(interval.value):.2f} times as long as with SAC (C)"
                    f"{task_by_task(ratios, lambda ratio: f'{np.exp(ratio):.2f}')}",
                    times(interval), judged_over_tasks(ratios, float(np.log(1.25))))
