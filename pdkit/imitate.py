@@ -3,6 +3,7 @@ best success over 50-episode evaluations)."""
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import math
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -18,6 +19,7 @@ from .errors import PdkitError, unknown
 from .evaluate import selection_scores
 from .gradient_steps import GradientSteps, make_optimizer
 from .policies import POLICIES, Policy
+from .profiles import checked
 from .tasks import get_task
 from .tasks.spec import TaskSpec
 
@@ -58,6 +60,22 @@ class ImitateConfig:
         if self.schedule == "constant":
             return 1.0
         return 0.5 * (1 + math.cos(math.pi * (iteration - self.lr_warmup) / max(1, self.iterations - self.lr_warmup)))
+
+
+def configured(kind: str, settings: dict[str, Any]) -> tuple[ImitateConfig, dict[str, Any]]:
+    """How a policy of `kind` is trained, and what it is made of, from flat names over its own recipe and defaults.
+
+    Raises PdkitError for an unknown kind or name, or a value that training cannot have.
+    """
+    if kind not in POLICIES:
+        raise unknown("policy", kind, POLICIES)
+    fields = {f.name for f in dataclasses.fields(ImitateConfig)}
+    given = set(POLICIES[kind].defaults) - set(POLICIES[kind].made)
+    for name in settings:
+        if name not in fields | given:
+            raise unknown("field", name, fields | given)
+    config = checked(ImitateConfig, POLICIES[kind].recipe | {name: value for name, value in settings.items() if name in fields})
+    return config, {name: value for name, value in settings.items() if name in given}
 
 
 class Windows:

@@ -3,7 +3,7 @@
 SPEC is a TOML (or JSON) file:
 
     name = "ablations"        # folder runs/sweeps/NAME
-    kind = "train"            # train: `pdkit train decorated`; notebook: `pdkit nb`
+    kind = "train"            # train: `pdkit train decorated`; base: `pdkit train base`; notebook: `pdkit nb`
     seeds = [0, 1, 2]         # every cell is run with each
     record = "ablations"      # optional: finished rows go to data/results/NAME.csv and NAME_curves.csv
     minutes = 4.0             # optional: what a job takes (trainings are estimated without it)
@@ -19,7 +19,8 @@ SPEC is a TOML (or JSON) file:
 All cells run with the first seed, then all with the next: a sweep that is stopped early compares them on fewer seeds.
 
 A training's values are the options of `pdkit train decorated` (task, method, profile, episodes, base, demos, num_demos) and
-any field of its configuration; a notebook's are `notebook` and its parameters. Paths are relative to the project's folder.
+any field of its configuration; a base policy's are those of `pdkit train base` (task, policy, episodes, demos, num_demos), likewise; a
+notebook's are `notebook` and its parameters. Paths are relative to the project's folder.
 """
 from __future__ import annotations
 
@@ -32,7 +33,7 @@ import re
 import shlex
 import tomllib
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +42,7 @@ from .cli import Parser
 from .demos import sources
 from .errors import PdkitError, unknown
 from .files import ROOT, read_json, runs_root
+from .imitate import configured
 from .main_job import duration, expected_minutes
 from .methods.registry import base_folder, method_config
 from .policies import load_policy
@@ -51,9 +53,11 @@ from .sweep_progress import Progress
 from .sweep_ray import Ray, must_be_installed
 from .sweep_run import LOG, Backend, Job, JobFunction, Local, run_job, run_jobs
 
-KINDS = ("train", "notebook")
+KINDS = ("train", "base", "notebook")
 DEFAULTS = {"method": "policy_decorator", "profile": "lesson", "episodes": 200}  # of a training
 OPTIONS = ("task", "method", "profile", "recipe", "episodes", "base", "demos", "num_demos")  # of the command; all else is --set
+BASE_DEFAULTS = {"policy": "bet", "episodes": 200}  # of the training of a base policy
+BASE_OPTIONS = ("task", "policy", "num_demos", "demos", "episodes")
 NAME = re.compile(r"[\w.-]+")
 RECIPE = re.compile(r"[\w.,=+-]+")
 
@@ -139,7 +143,7 @@ def _recipe(cell: dict[str, Any], name: str) -> str:
 
 def make_jobs(spec: Spec) -> list[Job]:
     """Every job, each checked as the command itself would: nothing runs before all are known to be right."""
-    make = {"train": _training, "notebook": _notebook}[spec.kind]
+    make = {"train": _training, "base": _imitation, "notebook": _notebook}[spec.kind]
     every = dict.fromkeys([*spec.seeds, *(seed for cell in spec.cells for seed in _seeds(spec, cell))])
     jobs = [make(spec, {name: value for name, value in cell.items() if name != "seeds"}, seed)
             for seed in every for cell in spec.cells if seed in _seeds(spec, cell)]
@@ -159,26 +163,46 @@ def _seeds(spec: Spec, cell: dict[str, Any]) -> Sequence[int]:
     return cell.get("seeds", spec.seeds)
 
 
-def _training(spec: Spec, cell: dict[str, Any], seed: int) -> Job:
-    cell = DEFAULTS | cell
+def _with_task(spec: Spec, cell: dict[str, Any]) -> dict[str, Any]:
+    """The cell of a training. Raises PdkitError where it has no task or no test."""
     if not isinstance(cell.get("task"), str):
         raise PdkitError(f"{spec.path.name}: a training needs a task, such as task = \"Door\".")
     if type(cell["episodes"]) is not int or cell["episodes"] < 1:
         raise PdkitError(f"{spec.path.name}: episodes must be a whole number of at least 1, not {cell['episodes']!r}.")
+    return cell
+
+
+def _training(spec: Spec, cell: dict[str, Any], seed: int) -> Job:
+    cell = _with_task(spec, DEFAULTS | cell)
     settings = {name: value for name, value in cell.items() if name not in OPTIONS}
     base = ROOT / cell["base"] if "base" in cell else base_folder(cell["method"], cell["task"])
     config = method_config(cell["method"], cell["task"], cell["profile"], seed, policy=load_policy(base), **settings)
     if config.demo_fraction:
         sources.given(cell["task"], ROOT / cell["demos"]) if "demos" in cell else sources.bundled(cell["task"])
-    words = ["train", "decorated", cell["task"]]
-    for name in OPTIONS[1:]:
-        if name in cell:
-            words += [f"--{name.replace('_', '-')}", str(cell[name])]
-    words += ["--seeds", str(seed)]
-    words += ["--set", *(f"{name}={_literal(value)}" for name, value in settings.items())] if settings else []
+    words = ["train", "decorated", *_options(OPTIONS, cell), "--seeds", str(seed), *_set(settings)]
     return _job(spec, cell | {"seed": seed}, {"task": cell["task"], "recipe": cell["recipe"], "seed": seed}, words, like=cell["method"],
                 config=flat(config) | {"base": read_card(base)["weights_sha256"]},
                 minutes=spec.minutes or expected_minutes(config, cell["episodes"]))
+
+
+def _imitation(spec: Spec, cell: dict[str, Any], seed: int) -> Job:
+    cell = _with_task(spec, BASE_DEFAULTS | cell)
+    settings = {name: value for name, value in cell.items() if name not in (*BASE_OPTIONS, "recipe")} | {"seed": seed}
+    config, _ = configured(cell["policy"], settings)
+    demos = sources.given(cell["task"], ROOT / cell["demos"]) if "demos" in cell else sources.bundled(cell["task"])
+    demos.first(cell.get("num_demos", demos.num))  # refuses more than there are
+    words = ["train", "base", *_options(BASE_OPTIONS, cell), *_set(settings)]
+    return _job(spec, cell | {"seed": seed}, {"task": cell["task"], "recipe": cell["recipe"], "seed": seed}, words,
+                like=f"{cell['task']} {cell['policy']}", config=asdict(config), minutes=spec.minutes)
+
+
+def _options(names: Sequence[str], cell: dict[str, Any]) -> list[str]:
+    """The task and the options that a cell gives, as words of a command."""
+    return [cell["task"], *(word for name in names[1:] if name in cell for word in (f"--{name.replace('_', '-')}", str(cell[name])))]
+
+
+def _set(settings: dict[str, Any]) -> list[str]:
+    return ["--set", *(f"{name}={_literal(value)}" for name, value in settings.items())] if settings else []
 
 
 def _literal(value: Any) -> str:

@@ -40,7 +40,7 @@ ONE_THREAD = {name: "1" for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPEN
 class Job:
     """One training or notebook with one set of values."""
 
-    kind: str  # train or notebook
+    kind: str  # train, base or notebook
     labels: dict[str, Any]  # task, recipe and seed: the keys of its recorded row
     words: tuple[str, ...]  # arguments of pdkit, without --out
     folder: Path  # its name holds a hash of the parameters
@@ -86,7 +86,7 @@ def run_job(job: Job) -> dict[str, Any]:
             process.kill()
     if code:
         raise PdkitError(_killed_by(-code) if code < 0 else _last_line(job.folder / LOG, start))
-    return _trained(job, out) if job.kind == "train" else {"row": _scalars(job.parameters) | _scalars(read_json(out / RESULT)), "curve": []}
+    return {"train": _trained, "base": _imitated, "notebook": _played}[job.kind](job, out)
 
 
 def _trained(job: Job, out: Path) -> dict[str, Any]:
@@ -96,6 +96,18 @@ def _trained(job: Job, out: Path) -> dict[str, Any]:
     manifest = read_json(folder / "manifest.json")
     curve = json.loads(pd.read_csv(folder / "metrics.csv").to_json(orient="records", double_precision=15))
     return {"row": manifest["results"], "curve": curve, "settings": manifest["parameters"]}
+
+
+def _imitated(job: Job, out: Path) -> dict[str, Any]:
+    info = read_json(out / "policy.json")["info"]
+    selected = info["selected"]
+    row = {"policy": job.parameters["policy"], "demos": info["demos"], "train_minutes": round(selected["seconds"] / 60, 2),
+           "cores": info["machine"]["cores"], "iteration": selected["iteration"], **info["test"]}
+    return {"row": row, "curve": [], "settings": info["imitate"]}
+
+
+def _played(job: Job, out: Path) -> dict[str, Any]:
+    return {"row": _scalars(job.parameters) | _scalars(read_json(out / RESULT)), "curve": []}
 
 
 def _scalars(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -2,7 +2,6 @@
 from __future__ import annotations
 
 import ast
-import dataclasses
 import hashlib
 import json
 import math
@@ -18,10 +17,10 @@ from .cli import Parser
 from .decorated import Decorated
 from .demos import Demos, sources
 from .demos.cli import Progress
-from .errors import PdkitError, unknown
+from .errors import PdkitError
 from .evaluate import evaluate
 from .files import DATA, atomic_file, runs_root
-from .imitate import ImitateConfig, imitate
+from .imitate import configured, imitate
 from .methods import METHODS
 from .methods.registry import base_folder as shipped_base
 from .methods.registry import make_trainer, method_config, trainer_of
@@ -34,7 +33,7 @@ from .pixels.pictures import encoded, pictures_of
 from .pixels.task import ENCODER, encoder_of, pixel_spec, save_visual
 from .policies import POLICIES, Policy, load_policy, save_policy
 from .policies.base import read_card
-from .profiles import PROFILES, checked, differences, flat
+from .profiles import PROFILES, differences, flat
 from .recorded import record
 from .runs import Run, describe_machine, origin
 from .seeds import reported_seeds
@@ -55,6 +54,7 @@ def main(argv: list[str]) -> int:
     base.add_argument("--out", help="folder of the checkpoint (default runs/base/TASK-POLICY)")
     base.add_argument("--pixels", action="store_true", help="see pictures instead of the object's state: train an encoder with the policy")
     base.add_argument("--device", default="auto", help="where it is trained: auto (CUDA where there is one), cpu or cuda")
+    base.add_argument("--episodes", type=int, default=0, help="test episodes of the selected policy, told in its policy.json (default: none)")
     decorated = kinds.add_parser("decorated", help="improve a base policy by online RL on sparse reward, by any of the methods")
     decorated.add_argument("task")
     decorated.add_argument("--profile", default="lesson", help=f"one of: {', '.join(PROFILES)}")
@@ -98,22 +98,17 @@ def base_demos(args) -> Demos:
 
 
 def _base(args) -> int:
-    if args.policy not in POLICIES:
-        raise unknown("policy", args.policy, POLICIES)
+    if args.episodes < 0:
+        raise PdkitError("--episodes must be 0 (no test) or more.")
     demos, settings = base_demos(args), parse_settings(args.set)
     shift = settings.pop("random_shift", None) if args.pixels else None
     if args.pixels:
         check_pixels(args.policy, shift)
-    fields = {f.name for f in dataclasses.fields(ImitateConfig)}
-    given = set(POLICIES[args.policy].defaults) - set(POLICIES[args.policy].made)
-    architecture = {k: v for k, v in settings.items() if k in given}
-    for name in settings:
-        if name not in fields | given:
-            raise unknown("field", name, fields | given)
-    config = checked(ImitateConfig, POLICIES[args.policy].recipe | {k: v for k, v in settings.items() if k in fields})
+    config, architecture = configured(args.policy, settings)
     device = pick_device(args.device) if POLICIES[args.policy].learns else "cpu"
     out = Path(args.out) if args.out else runs_root() / "base" / f"{args.task}-{args.policy}{'-pixels' if args.pixels else ''}"
     print(f"{args.policy} on {demos.num} demonstrations of {args.task} ({demos.label}), on {device}: {config}", flush=True)
+    encoder = None
 
     def show(row: dict[str, float]) -> None:
         print("  " + ", ".join(f"{k} {v:.3g}" for k, v in row.items()), flush=True)
@@ -129,6 +124,10 @@ def _base(args) -> int:
     best = max(history, key=lambda row: row.get("success_once", row["iteration"]))
     info = {"task": args.task, "demos": demos.num, "demos_checksum": demos.checksum, "label": demos.label, "imitate": asdict(config),
             "selected": best, "command": "pdkit train " + " ".join(sys.argv[2:]), "device": device, "machine": describe_machine()}
+    if args.episodes:
+        spec = pixel_spec(get_task(args.task), encoder) if encoder else get_task(args.task)
+        info["test"] = {"episodes": args.episodes} | _outcome("base", _episodes(policy.to("cpu"), spec, args.episodes))
+        print("  " + ", ".join(f"{k} {v}" for k, v in info["test"].items()), flush=True)
     if args.pixels:
         save_visual(policy, encoder, out, info)
     else:

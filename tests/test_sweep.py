@@ -145,6 +145,9 @@ SPEC = {"name": "tiny", "kind": "train", "seeds": [0], "fixed": {"task": "Door",
         "grid": {"alpha": [0.1, 0.3]}}
 BOOK = {"name": "book", "kind": "notebook", "fixed": {"notebook": "05", "profile": "smoke"}, "grid": {"alpha": [0.1]}}
 
+BASE = {"kind": "base", "fixed": {"task": "Door", "num_demos": 2, "episodes": 2, "eval_episodes": 0, "batch": 8},
+        "grid": {"policy": ["mlp", "bet"], "iterations": [3]}}
+
 
 def written(folder: Path, **changes) -> Path:
     path = folder / "spec.json"
@@ -235,6 +238,12 @@ def test_the_folder_follows_every_parameter_and_nothing_else(tmp_path):
     ({"grid": {"alpha_scale": [[1, 2]]}}, "Give the cell 'alpha_scale=[1, 2]' a recipe"),
     ({"cells": [{"alpha": 0.1, "recipe": "again"}]}, "alpha=0.1 and again are the same job"),
     ({"cells": [{"alpha": 0.2, "recipe": "alpha=0.1"}]}, "are called the same"),
+    (BASE | {"fixed": {}}, "a training needs a task"),
+    (BASE | {"grid": {"policy": ["bett"]}}, "Did you mean 'bet'?"),
+    (BASE | {"grid": {"iterrations": [3]}}, "Did you mean 'iterations'?"),
+    (BASE | {"grid": {"batch": ["big"]}, "fixed": {"task": "Door"}}, "batch must be of type int"),
+    (BASE | {"fixed": {"task": "Door", "num_demos": 99}}, "99"),
+    (BASE | {"fixed": {"task": "Door", "episodes": 0}}, "episodes must be a whole number"),
     (BOOK | {"fixed": {}}, "needs notebook"),
     (BOOK | {"fixed": {"notebook": "99"}}, "Unknown notebook '99'"),
     (BOOK | {"grid": {"alhpa": [0.1]}}, "Did you mean 'alpha'?"),
@@ -432,6 +441,26 @@ def test_a_notebook_is_run_with_each_value_and_its_result_becomes_a_row(tmp_path
     table = pd.read_csv(results / "book.csv", dtype=str)
     assert list(table.seen) == ["a ba b", "11"] and list(table["part.total"]) == ["9", "9"] and list(table.seed) == ["4", "4"]
     assert "all" not in table and not (results / "book_curves.csv").exists() and nb.notebooks().get(name) is None
+
+
+def test_base_policies_are_trained_and_tested_and_what_they_solve_becomes_a_row(tmp_path, results, capsys, monkeypatch):
+    path = written(tmp_path, **BASE, seeds=[3])
+    assert cli.main(["sweep", str(path), "--record", "bases"]) == 0, capsys.readouterr().out
+    table = pd.read_csv(results / "bases.csv").set_index("recipe")
+    assert list(table.index) == ["policy=bet,iterations=3", "policy=mlp,iterations=3"] and list(table.policy) == ["bet", "mlp"]
+    assert (table[["demos", "iteration", "episodes", "seed"]] == [2, 3, 2, 3]).all(axis=None) and table.base_success.between(0, 1).all()
+    assert table.command["policy=mlp,iterations=3"] == ("pdkit train base Door --policy mlp --num-demos 2 --episodes 2 --set eval_episodes=0 "
+                                                        "batch=8 iterations=3 seed=3")
+    assert not (results / "bases_curves.csv").exists() and not (results / "bases.png").exists()
+    one = sweep.make_jobs(sweep.load_spec(path))[0]
+    card = read_card(one.folder / "run")
+    assert card["info"]["test"]["episodes"] == 2 and card["info"]["imitate"]["seed"] == 3
+    capsys.readouterr()
+    monkeypatch.setattr(Local, "start", None)  # nothing may start again
+    assert cli.main(["sweep", str(path)]) == 0 and "2 jobs, 2 finished, 0 to do" in capsys.readouterr().out
+    result = read_json(one.result)
+    write_json(one.result, result | {"settings": result["settings"] | {"lr": 0.5}})
+    assert cli.main(["sweep", str(path)]) == 2 and "with other values of lr than" in capsys.readouterr().err
 
 
 # ---- Ray -------------------------------------------------------------------------------------------------------------

@@ -51,6 +51,7 @@ def test_demonstrations_from_the_command_line(monkeypatch, tmp_path, capsys):
     ("train", "decorated", "Door", "--set", "log_std_range=(1.0,)"), ("train", "base", "Door", "--set", "eval_every=0"),
     ("train", "base", "Door", "--set", "lr=fast"), ("train", "decorated", "Door", "--set", "batch=100000"),
     ("train", "decorated", "Door", "--base", "nowhere"), ("train", "base", "Door", "--device", "gpu"),
+    ("train", "base", "Door", "--episodes", "-1"),
 ])
 def test_bad_input_is_one_sentence_and_exit_code_2(monkeypatch, capsys, words):
     assert call(monkeypatch, *words) == 2
