@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from .ablations import differences
 from .claims import DECORATOR
 from .decorated import Decorated
 from .demos import sources
@@ -153,6 +154,19 @@ def _text(value: float, low: float = np.nan, high: float = np.nan, scale: float 
     if np.isnan(value):
         return "-"
     return f"{scale * value:{form}}" + ("" if np.isnan(low) else f" ({scale * low:{form}} to {scale * high:{form}})")
+
+
+def forms(table: pd.DataFrame) -> pd.DataFrame:
+    """The paper's Table 10 from rows of data/results/bet_forms.csv, as text, a row a task: how often the original Behavior Transformer
+    succeeds and the one that SAC can fine-tune, and the difference seed by seed (`ablations.differences`)."""
+    rows = []
+    for task, part in table.groupby("task"):
+        success = part.groupby("recipe").base_success.mean()
+        rows += [{"task": task, "demonstrations": part.demos.iloc[0], "seeds": row.seeds, "original, %": _text(success["bet"], scale=100),
+                  "modified, %": _text(success["bet-sac"], scale=100),
+                  "modified less original, points": _text(row.value, row.low, row.high, scale=100, form="+.0f")}
+                 for row in differences(part, {"bet-sac": ""}, "bet", "base_success").itertuples()]
+    return pd.DataFrame(rows)
 
 
 def smoothness(table: pd.DataFrame, labels: Mapping[str, str] | None = None) -> pd.DataFrame:

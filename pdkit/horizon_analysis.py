@@ -19,7 +19,7 @@ import pandas as pd
 import torch
 import torch.nn.functional as F
 
-from .claims import TooLittle, by_seed, difference, judged_over_tasks, matched, weakest
+from .claims import FLOOR, TooLittle, by_seed, difference, judged_over_tasks, matched, weakest
 from .errors import PdkitError, unknown
 from .evaluate import Actor
 from .rl.networks import Critics
@@ -170,17 +170,18 @@ def exploration_verdict(table: pd.DataFrame) -> tuple[str, list[str]]:
     """"With a longer horizon, random exploration meets the sparse reward less often", from rows start_fraction, episodes, solved.
 
     reproduced: the rate at the longest horizon lies below that at the shortest, Wilson intervals apart, and no horizon between has an
-    interval wholly above that of a shorter one. partly: the ends are ordered so, but something between is not. not: the ends' intervals
-    overlap, or are the other way round. untested: fewer than two horizons.
+    interval wholly above that of a shorter one. partly: the ends are ordered so, but their intervals overlap, or something between is not.
+    not: the ends are not ordered so. untested: fewer than two horizons, or hardly any reward at either end, so that no order could show.
     """
     rows = table.sort_values("start_fraction")
     rates = [wilson(int(r.solved), int(r.episodes)) for r in rows.itertuples()]
     said = [f"start at {f:g} of the way: {rate}" for f, rate in zip(rows.start_fraction, rates, strict=True)]
-    if len(rates) < 2:
+    if len(rates) < 2 or max(rates[0].value, rates[-1].value) < FLOOR:
         return "untested", said
-    ends = rates[0].high < rates[-1].low
     turns = any(longer.low > shorter.high for longer, shorter in zip(rates[:-1], rates[1:], strict=True))
-    return ("not" if not ends else "partly" if turns else "reproduced"), said
+    if rates[0].value >= rates[-1].value:
+        return "not", said
+    return ("reproduced" if rates[0].high < rates[-1].low and not turns else "partly"), said
 
 
 def propagation_verdict(table: pd.DataFrame) -> tuple[str, list[str]]:

@@ -87,12 +87,13 @@ def propagation_figure(table: pd.DataFrame, title: str = "") -> Picture:
 
 
 @styled
-def sweep_figure(table: pd.DataFrame, column: str, labels: dict[str, str], *, own: pd.DataFrame | None = None, budget: int = 0,
-                 title: str = "", ylabel: str = "") -> Picture:
+def sweep_figure(table: pd.DataFrame, column: str, labels: dict[str, str], *, own: pd.DataFrame | None = None,
+                 trained: pd.DataFrame | None = None, budget: int = 0, title: str = "", ylabel: str = "") -> Picture:
     """`column` of `by_fraction` rows against the horizon: a dot a seed, the mean and its bootstrap interval, a line a method of `labels`.
 
     Args:
         own: the reader's rates of base policies (who, start_fraction, success), as dashed lines; only where `column` is a success.
+        trained: the reader's own training, as `table` has it: a star of its method's colour.
         budget: for steps: a run without a value is drawn there as an open triangle, left out of the mean; the axis is logarithmic.
     """
     _columns(table, "method", "start_fraction", column)
@@ -110,11 +111,16 @@ def sweep_figure(table: pd.DataFrame, column: str, labels: dict[str, str], *, ow
             interval = over_seeds(np.mean, values.to_numpy()[:, None], repetitions=500)
             ax.plot([1 - fraction + shift] * 2, [interval.low, interval.high], color=color, lw=2.2)
         ax.plot([1 - f + shift for f, _ in groups], [v.mean() for _, v in groups], "-o", ms=6, color=color, label=name)
+    for run in [] if trained is None else trained[trained.method.isin(present)].itertuples():
+        known = pd.notna(value := getattr(run, column))
+        ax.plot(1 - run.start_fraction, value if known else budget, "*" if known else "^", ms=15, mec="k", mew=0.8,
+                color=PALETTE[list(present).index(run.method)], mfc=None if known else "white", zorder=5,
+                label=f"your run, {present[run.method]}, {run.env_steps:,} steps")
     if own is not None:
         for who, rows in own.groupby("who", sort=False):
             ax.plot(1 - rows.start_fraction, rows.success, "--", marker="o", ms=6, mfc="white", lw=1.2, color=COLORS["base"],
                     alpha=1.0 if who == own.who.iloc[0] else 0.5, label=f"{who}, your run")
-    _horizons(ax, table.start_fraction)
+    _horizons(ax, table.start_fraction if trained is None else [*table.start_fraction, *trained.start_fraction])
     if budget:
         ax.plot([], [], "^", ms=7, mfc="white", color="0.3", label="no reward in the whole run")
         ax.set(yscale="log", ylabel=ylabel or column.replace("_", " "))

@@ -54,8 +54,9 @@ def load(name: str, task: str | None = None) -> tuple[pd.DataFrame, pd.DataFrame
     every = pd.read_csv(path) if path.exists() else pd.DataFrame(columns=KEYS)
     table = every if task is None else every[every.task == task]
     if table.empty:
-        known = ", ".join(dict.fromkeys(every.task))
-        others = f", only of {known}." if known else f"; `pdkit sweep data/sweeps/{name}.toml` makes them."
+        known, spec = ", ".join(dict.fromkeys(every.task)), DATA / "sweeps" / f"{name}.toml"
+        sweep = f"; `pdkit sweep data/sweeps/{spec.name}` makes them." if spec.exists() else ", and no sweep in data/sweeps makes them."
+        others = f", only of {known}." if known else sweep
         raise PdkitError(f"No results {name!r}{f' of {task}' if task else ''} are recorded in data/results{others}")
     lines = pd.read_csv(curves) if curves.exists() else pd.DataFrame(columns=[*KEYS, "step"])
     return table.reset_index(drop=True), lines[lines.task.isin(table.task)].reset_index(drop=True)
@@ -109,7 +110,8 @@ def figure(table: pd.DataFrame, curves: pd.DataFrame, task: str = "Door") -> Fig
     """Left: evaluations on selection seeds during training, a line a run. Right: success on the test seeds, with intervals.
 
     Runs are named by their recipe where there are several recipes, by their seed otherwise; several recipes with several seeds
-    are a line a recipe (the mean), and a bar with a dot a seed.
+    are a line a recipe (the mean), and a bar with a dot a seed. Where recipes start from different successes of one kind of policy, each bar
+    has a tick at its own.
     """
     table, curves = table[table.task == task], curves[curves.task == task]
     recipes, several = list(dict.fromkeys(table.recipe)), table.recipe.nunique() > 1
@@ -117,12 +119,12 @@ def figure(table: pd.DataFrame, curves: pd.DataFrame, task: str = "Door") -> Fig
     height = max(4.4 if several else 3.6, 0.22 * (len(recipes) if means else len(table)))
     fig, (left, right) = plt.subplots(1, 2, figsize=(10, height), width_ratios=(3, 2), layout="constrained")
     colors = plt.get_cmap("tab20" if several else "tab10")
-    # The first row's of each kind of policy; a recipe with another base policy of the same kind is named so.
-    kinds = table.drop_duplicates("policy") if "policy" in table else table.iloc[:1]
-    bases = {f"base ({row.policy})" if len(kinds) > 1 else "base": row.base_success for row in kinds.itertuples()}
-    bars = [(name, [value], "0.65") for name, value in bases.items()]
     groups = [(r, r, table[table.recipe == r]) for r in recipes] if means else \
         [(f"{r.recipe}, seed {r.seed}" if several else f"seed {r.seed}", r.recipe, table.loc[[i]]) for i, r in table.iterrows()]
+    kinds = table.groupby("policy", sort=False).base_success if "policy" in table else table.groupby("task").base_success
+    bases = {f"base ({kind})" if len(kinds) > 1 else "base": starts.iloc[0] for kind, starts in kinds if starts.nunique() == 1}
+    ticks = {name: rows.base_success.mean() for name, _, rows in groups if len(bases) < len(kinds)}
+    bars = [(name, [value], "0.65") for name, value in bases.items()]
     for i, (name, recipe, rows) in enumerate(groups):
         color = colors(i % colors.N)
         curve = curves[(curves.recipe == recipe) & curves.seed.isin(rows.seed)].dropna(subset=["success_once"])
@@ -145,10 +147,12 @@ def figure(table: pd.DataFrame, curves: pd.DataFrame, task: str = "Door") -> Fig
         else:
             rate = wilson(round(value * count), count)
             right.errorbar(100 * value, y, xerr=[[100 * (value - rate.low)], [100 * (rate.high - value)]], color="k", capsize=3, lw=1)
+        if name in ticks:
+            right.plot([100 * ticks[name]] * 2, [y - 0.4, y + 0.4], color="0.4", lw=2)
         right.text(3, y, f"{100 * value:.0f}", va="center", color="white", weight="bold", fontsize=8)
     right.set_yticks(range(len(bars)), [name for name, _, _ in reversed(bars)], fontsize=8)
     right.set(xlabel="success within the episode (%)", xlim=(0, 102),
-              title=f"{count} test episodes, {'mean and seeds' if means else '95 % intervals'}")
+              title=f"{count} test episodes, {'grey: its start' if ticks else 'mean and seeds' if means else '95 % intervals'}")
     for ax in (left, right):
         ax.spines[["top", "right"]].set_visible(False)
     plt.close(fig)

@@ -54,7 +54,7 @@ def main(argv: list[str]) -> int:
     base.add_argument("--out", help="folder of the checkpoint (default runs/base/TASK-POLICY)")
     base.add_argument("--pixels", action="store_true", help="see pictures instead of the object's state: train an encoder with the policy")
     base.add_argument("--device", default="auto", help="where it is trained: auto (CUDA where there is one), cpu or cuda")
-    base.add_argument("--episodes", type=int, default=0, help="test episodes of the selected policy, told in its policy.json (default: none)")
+    base.add_argument("--episodes", type=int, default=0, help="test episodes, told in its policy.json (default: none)")
     decorated = kinds.add_parser("decorated", help="improve a base policy by online RL on sparse reward, by any of the methods")
     decorated.add_argument("task")
     decorated.add_argument("--profile", default="lesson", help=f"one of: {', '.join(PROFILES)}")

@@ -182,10 +182,12 @@ def test_task_horizon(tmp_path):
     assert result["starts"]["0"]["hinge"] < result["starts"]["0.9"]["hinge"] < 1.35
     assert result["verdicts"]["propagation"] == "reproduced" and result["exercise_solved"] is False
     assert (tmp_path / "exploration.png").exists() and not (tmp_path / "starts.png").exists()
+    assert result["own"]["recipe"] == "sac_finetune,start_fraction=0.5" and result["own"]["steps"] >= 600
 
 
 def test_task_horizon_of_the_cube(tmp_path):
-    result = run("10", tmp_path, task="StackCube", episodes=2, n_steps="[5]")
+    result = run("10", tmp_path, task="StackCube", episodes=2, n_steps="[5]", own_method="policy_decorator", own_start=0.75)
+    assert result["own"]["recipe"] == "policy_decorator,start_fraction=0.75"
     assert result["task"] == "StackCube" and result["starts"]["0.9"]["apart"] < 0.05 < result["starts"]["0"]["apart"]
 
 

@@ -17,6 +17,10 @@ def test_rows_and_curves_of_one_task_are_loaded(results):
 
 
 def test_what_is_not_recorded_is_said_with_the_command_that_makes_it(results):
+    with pytest.raises(PdkitError, match="No results 'x' are recorded.*no sweep in data/sweeps makes them"):
+        recorded.load("x")
+    (results.parent / "sweeps").mkdir()
+    (results.parent / "sweeps" / "x.toml").touch()
     with pytest.raises(PdkitError, match="No results 'x' are recorded.*pdkit sweep data/sweeps/x.toml"):
         recorded.load("x")
     pd.DataFrame({"task": ["Pen"], "recipe": "a", "seed": 0}).to_csv(results / "x.csv", index=False)
@@ -48,6 +52,17 @@ def test_the_picture_shows_every_policy_that_methods_start_from():
         assert {name: widths[name] for name in expected} == pytest.approx(expected)
         dashes = sorted(line.get_ydata()[0] / 100 for line in left.lines if line.get_linestyle() == "--")
         assert dashes == sorted(value for name, value in expected.items() if name.startswith("base"))
+
+
+def test_recipes_that_start_from_different_successes_show_each_its_own():
+    """As over several horizons: the first one's would stand for all."""
+    rows = pd.DataFrame({"task": "Door", "recipe": ["a", "a", "b", "b"], "policy": "bet", "seed": [0, 1, 0, 1], "episodes": 60,
+                         "base_success": [0.5, 0.5, 0.9, 0.9], "decorated_success": [0.7, 0.8, 0.1, 0.2]})
+    left, right = recorded.figure(rows, rows[["task", "recipe", "seed"]].assign(step=1_000, success_once=0.6)).axes
+    names = [label.get_text() for label in right.get_yticklabels()]
+    ticks = {names[round(sum(line.get_ydata()) / 2)]: line.get_xdata()[0] / 100 for line in right.lines if line.get_color() == "0.4"}
+    assert ticks == {"a": 0.5, "b": 0.9} and sorted(names) == ["a", "b"]
+    assert not [line for line in left.lines if line.get_linestyle() == "--"]
 
 
 def test_the_manifest_names_every_machine_that_recorded(results, monkeypatch):

@@ -449,8 +449,8 @@ def test_base_policies_are_trained_and_tested_and_what_they_solve_becomes_a_row(
     table = pd.read_csv(results / "bases.csv").set_index("recipe")
     assert list(table.index) == ["policy=bet,iterations=3", "policy=mlp,iterations=3"] and list(table.policy) == ["bet", "mlp"]
     assert (table[["demos", "iteration", "episodes", "seed"]] == [2, 3, 2, 3]).all(axis=None) and table.base_success.between(0, 1).all()
-    assert table.command["policy=mlp,iterations=3"] == ("pdkit train base Door --policy mlp --num-demos 2 --episodes 2 --set eval_episodes=0 "
-                                                        "batch=8 iterations=3 seed=3")
+    assert table.command["policy=mlp,iterations=3"] == ("pdkit train base Door --policy mlp --num-demos 2 --episodes 2 --set "
+                                                        "eval_episodes=0 batch=8 iterations=3 seed=3")
     assert not (results / "bases_curves.csv").exists() and not (results / "bases.png").exists()
     one = sweep.make_jobs(sweep.load_spec(path))[0]
     card = read_card(one.folder / "run")

@@ -440,6 +440,26 @@ def test_unlearning_the_cube(results, success, lifted, verdicts_of):
     assert found == [*verdicts_of, "reproduced"]
 
 
+@pytest.mark.parametrize("off, expected, everywhere", [
+    ([0.02, -0.03, 0.0], "partly", "reproduced"),  # alike, but on two of the paper's eight tasks
+    ([0.4, -0.4, 0.03], "partly", "partly"),  # alike on average, seeds far apart
+    ([0.15, 0.14, 0.13], "partly", "not"),  # on average over the two tasks within 10 points, but one is beyond
+    ([-0.3, -0.3, -0.31], "not", "not")])
+def test_the_modified_bet_must_be_within_10_points_of_the_original(results, off, expected, everywhere):
+    """`off` the original on StackCube, exactly as good on Door; then on all eight tasks."""
+    plain = np.array([0.5, 0.6, 0.4])
+    claim, = starting("The BeT modified")
+
+    def verdict_of(tasks):
+        write(results, "bet_forms", *(runs(form, plain, task=task, base=plain + (np.array(shift) if form == "bet-sac" else 0))
+                                      for task, shift in tasks.items() for form in ("bet", "bet-sac")))
+        return verdicts.find(claim).verdict
+
+    assert verdict_of({"Door": [0.0] * 3, "StackCube": off}) == expected
+    assert f"StackCube {100 * np.mean(off):+.1f})" in verdicts.find(claim).measured
+    assert verdict_of(dict.fromkeys(verdicts.registry.EIGHT, off)) == everywhere
+
+
 def starting(*starts):
     return [CLAIMS.claim[CLAIMS.claim.str.startswith(start)].item() for start in starts]
 
