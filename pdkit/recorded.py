@@ -110,8 +110,8 @@ def figure(table: pd.DataFrame, curves: pd.DataFrame, task: str = "Door") -> Fig
     """Left: evaluations on selection seeds during training, a line a run. Right: success on the test seeds, with intervals.
 
     Runs are named by their recipe where there are several recipes, by their seed otherwise; several recipes with several seeds
-    are a line a recipe (the mean), and a bar with a dot a seed. Where recipes start from different successes of one kind of policy, each bar
-    has a tick at its own.
+    are a line a recipe (the mean), and a bar with a dot a seed. Where recipes start from different successes of one kind of policy,
+    each bar has a tick at its own.
     """
     table, curves = table[table.task == task], curves[curves.task == task]
     recipes, several = list(dict.fromkeys(table.recipe)), table.recipe.nunique() > 1
