@@ -88,7 +88,10 @@ def from_scratch(recipe: str) -> bool:
 
 
 def shared(table: pd.DataFrame) -> pd.DataFrame:
-    """The rows of those recipes that are recorded on every task of the table."""
+    """The rows of those recipes that are recorded on every task on which the decorator is: a comparison without it (PPO on Pen) is of
+    its own kind."""
+    theirs = table.task[table.recipe == DECORATOR]
+    table = table[table.task.isin(theirs)] if len(theirs) else table
     count = table.groupby("recipe").task.nunique()
     return table[table.recipe.isin(count.index[count == table.task.nunique()])]
 
@@ -158,14 +161,17 @@ def _text(value: float, low: float = np.nan, high: float = np.nan, scale: float 
 
 def forms(table: pd.DataFrame) -> pd.DataFrame:
     """The paper's Table 10 from rows of data/results/bet_forms.csv, as text, a row a task: how often the original Behavior Transformer
-    succeeds and the one that SAC can fine-tune, and the difference seed by seed (`ablations.differences`)."""
-    rows = []
+    succeeds and the one that SAC can fine-tune, and the difference seed by seed, over the seeds of both. Raises PdkitError without any."""
+    rows, names = [], ["bet", "bet-sac"]
     for task, part in table.groupby("task"):
-        success = part.groupby("recipe").base_success.mean()
-        rows += [{"task": task, "demonstrations": part.demos.iloc[0], "seeds": row.seeds, "original, %": _text(success["bet"], scale=100),
-                  "modified, %": _text(success["bet-sac"], scale=100),
+        pairs = part.pivot(index="seed", columns="recipe", values="base_success").reindex(columns=names).dropna()
+        both = part[part.seed.isin(pairs.index)]
+        original, modified = (_text(pairs[name].mean(), scale=100) for name in names)
+        rows += [{"task": task, "demonstrations": both.demos.iloc[0], "seeds": row.seeds, "original, %": original, "modified, %": modified,
                   "modified less original, points": _text(row.value, row.low, row.high, scale=100, form="+.0f")}
-                 for row in differences(part, {"bet-sac": ""}, "bet", "base_success").itertuples()]
+                 for row in differences(both, {"bet-sac": ""}, "bet", "base_success").itertuples()]
+    if not rows:
+        raise PdkitError("No seed of both forms is recorded; `pdkit sweep data/sweeps/bet_forms.toml` makes them.")
     return pd.DataFrame(rows)
 
 

@@ -171,12 +171,12 @@ def exploration_verdict(table: pd.DataFrame) -> tuple[str, list[str]]:
 
     reproduced: the rate at the longest horizon lies below that at the shortest, Wilson intervals apart, and no horizon between has an
     interval wholly above that of a shorter one. partly: the ends are ordered so, but their intervals overlap, or something between is not.
-    not: the ends are not ordered so. untested: fewer than two horizons, or hardly any reward at either end, so that no order could show.
+    not: the ends are not ordered so. untested: fewer than two horizons, or hardly any reward at any, so that no order could show.
     """
     rows = table.sort_values("start_fraction")
     rates = [wilson(int(r.solved), int(r.episodes)) for r in rows.itertuples()]
     said = [f"start at {f:g} of the way: {rate}" for f, rate in zip(rows.start_fraction, rates, strict=True)]
-    if len(rates) < 2 or max(rates[0].value, rates[-1].value) < FLOOR:
+    if len(rates) < 2 or max(rate.value for rate in rates) < FLOOR:
         return "untested", said
     turns = any(longer.low > shorter.high for longer, shorter in zip(rates[:-1], rates[1:], strict=True))
     if rates[0].value >= rates[-1].value:

@@ -65,7 +65,7 @@ class ImitateConfig:
 def configured(kind: str, settings: dict[str, Any]) -> tuple[ImitateConfig, dict[str, Any]]:
     """How a policy of `kind` is trained, and what it is made of, from flat names over its own recipe and defaults.
 
-    Raises PdkitError for an unknown kind or name, or a value that training cannot have.
+    Raises PdkitError for an unknown kind or name, or a value that training cannot have; what the policy is made of `untrained` checks.
     """
     if kind not in POLICIES:
         raise unknown("policy", kind, POLICIES)
@@ -76,6 +76,11 @@ def configured(kind: str, settings: dict[str, Any]) -> tuple[ImitateConfig, dict
             raise unknown("field", name, fields | given)
     config = checked(ImitateConfig, POLICIES[kind].recipe | {name: value for name, value in settings.items() if name in fields})
     return config, {name: value for name, value in settings.items() if name in given}
+
+
+def untrained(kind: str, spec: TaskSpec, architecture: dict[str, Any] | None = None) -> Policy:
+    """A new policy of `kind` for a task. Raises PdkitError for settings that it cannot have."""
+    return POLICIES[kind]({"obs_dim": spec.obs_dim, "act_dim": spec.act_dim, **POLICIES[kind].for_task(spec), **(architecture or {})})
 
 
 class Windows:
@@ -175,7 +180,7 @@ def imitate(kind: str, demos: Demos, config: ImitateConfig | None = None, policy
     spec = spec or get_task(demos.task)
     torch.manual_seed(config.seed)
     generator = torch.Generator().manual_seed(config.seed)
-    policy = POLICIES[kind]({"obs_dim": spec.obs_dim, "act_dim": spec.act_dim, **POLICIES[kind].for_task(spec), **(policy_config or {})})
+    policy = untrained(kind, spec, policy_config)
     policy.fit_statistics(demos.observations, demos.actions, config.seed)
     policy.to(device).train()
     windows = Windows(demos, policy.window, config.pad_start, policy.horizon, spec.resting, config.hold_end)

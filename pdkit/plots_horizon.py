@@ -93,13 +93,15 @@ def sweep_figure(table: pd.DataFrame, column: str, labels: dict[str, str], *, ow
 
     Args:
         own: the reader's rates of base policies (who, start_fraction, success), as dashed lines; only where `column` is a success.
-        trained: the reader's own training, as `table` has it: a star of its method's colour.
-        budget: for steps: a run without a value is drawn there as an open triangle, left out of the mean; the axis is logarithmic.
+        trained: the reader's own training, as `table` has it, with episodes: a star of its method's colour.
+        budget: for steps: a run without a value is drawn there (the reader's at its own env_steps) as an open triangle, left out of the
+            mean; the axis is logarithmic.
     """
     _columns(table, "method", "start_fraction", column)
     figure, axes = blank(size=(7.6, 4.2))
     ax = axes[0, 0]
-    present = {method: name for method, name in labels.items() if method in set(table.method)}
+    seen = set(table.method) | set([] if trained is None else trained.method)
+    present = {method: name for method, name in labels.items() if method in seen}
     for i, (method, name) in enumerate(present.items()):
         rows, color, shift = table[table.method == method], PALETTE[i], 0.012 * (i - 1)
         known = rows.dropna(subset=[column])
@@ -111,11 +113,11 @@ def sweep_figure(table: pd.DataFrame, column: str, labels: dict[str, str], *, ow
             interval = over_seeds(np.mean, values.to_numpy()[:, None], repetitions=500)
             ax.plot([1 - fraction + shift] * 2, [interval.low, interval.high], color=color, lw=2.2)
         ax.plot([1 - f + shift for f, _ in groups], [v.mean() for _, v in groups], "-o", ms=6, color=color, label=name)
-    for run in [] if trained is None else trained[trained.method.isin(present)].itertuples():
+    for run in () if trained is None else trained[trained.method.isin(present)].itertuples():
         known = pd.notna(value := getattr(run, column))
-        ax.plot(1 - run.start_fraction, value if known else budget, "*" if known else "^", ms=15, mec="k", mew=0.8,
+        ax.plot(1 - run.start_fraction, value if known else run.env_steps, "*" if known else "^", ms=15, mec="k", mew=0.8,
                 color=PALETTE[list(present).index(run.method)], mfc=None if known else "white", zorder=5,
-                label=f"your run, {present[run.method]}, {run.env_steps:,} steps")
+                label=f"your run, {present[run.method]}, {run.env_steps:,} steps, {run.episodes} episodes")
     if own is not None:
         for who, rows in own.groupby("who", sort=False):
             ax.plot(1 - rows.start_fraction, rows.success, "--", marker="o", ms=6, mfc="white", lw=1.2, color=COLORS["base"],

@@ -151,8 +151,8 @@ def figure(table: pd.DataFrame, curves: pd.DataFrame, task: str = "Door") -> Fig
             right.plot([100 * ticks[name]] * 2, [y - 0.4, y + 0.4], color="0.4", lw=2)
         right.text(3, y, f"{100 * value:.0f}", va="center", color="white", weight="bold", fontsize=8)
     right.set_yticks(range(len(bars)), [name for name, _, _ in reversed(bars)], fontsize=8)
-    right.set(xlabel="success within the episode (%)", xlim=(0, 102),
-              title=f"{count} test episodes, {'grey: its start' if ticks else 'mean and seeds' if means else '95 % intervals'}")
+    shown = f"{count} test episodes, {'mean and seeds' if means else '95 % intervals'}"
+    right.set(xlabel="success within the episode (%)", xlim=(0, 102), title=f"{shown}\n(grey: its start)" if ticks else shown)
     for ax in (left, right):
         ax.spines[["top", "right"]].set_visible(False)
     plt.close(fig)

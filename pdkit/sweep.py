@@ -6,7 +6,7 @@ SPEC is a TOML (or JSON) file:
     kind = "train"            # train: `pdkit train decorated`; base: `pdkit train base`; notebook: `pdkit nb`
     seeds = [0, 1, 2]         # every cell is run with each
     record = "ablations"      # optional: finished rows go to data/results/NAME.csv and NAME_curves.csv
-    minutes = 4.0             # optional: what a job takes (trainings are estimated without it)
+    minutes = 4.0             # optional: what a job takes (kind train is estimated without it)
     [fixed]                   # values of every cell
     task = "Door"
     [grid]                    # every combination of these lists is a cell
@@ -19,8 +19,8 @@ SPEC is a TOML (or JSON) file:
 All cells run with the first seed, then all with the next: a sweep that is stopped early compares them on fewer seeds.
 
 A training's values are the options of `pdkit train decorated` (task, method, profile, episodes, base, demos, num_demos) and
-any field of its configuration; a base policy's are those of `pdkit train base` (task, policy, episodes, demos, num_demos), likewise; a
-notebook's are `notebook` and its parameters. Paths are relative to the project's folder.
+any field of its configuration; a base policy's are these options of `pdkit train base` (task, policy, episodes, demos, num_demos) and what
+it takes by --set; a notebook's are `notebook` and its parameters. Paths are relative to the project's folder.
 """
 from __future__ import annotations
 
@@ -42,22 +42,24 @@ from .cli import Parser
 from .demos import sources
 from .errors import PdkitError, unknown
 from .files import ROOT, read_json, runs_root
-from .imitate import configured
+from .imitate import configured, untrained
 from .main_job import duration, expected_minutes
 from .methods.registry import base_folder, method_config
-from .policies import load_policy
+from .policies import POLICIES, load_policy
 from .policies.base import read_card
 from .profiles import flat
 from .runs import NO_MATTER
 from .sweep_progress import Progress
 from .sweep_ray import Ray, must_be_installed
 from .sweep_run import LOG, Backend, Job, JobFunction, Local, run_job, run_jobs
+from .tasks import get_task
 
 KINDS = ("train", "base", "notebook")
 DEFAULTS = {"method": "policy_decorator", "profile": "lesson", "episodes": 200}  # of a training
 OPTIONS = ("task", "method", "profile", "recipe", "episodes", "base", "demos", "num_demos")  # of the command; all else is --set
 BASE_DEFAULTS = {"policy": "bet", "episodes": 200}  # of the training of a base policy
 BASE_OPTIONS = ("task", "policy", "num_demos", "demos", "episodes")
+NUMBERS = ("episodes", "num_demos")  # of all these; the others are words
 NAME = re.compile(r"[\w.-]+")
 RECIPE = re.compile(r"[\w.,=+-]+")
 
@@ -163,17 +165,21 @@ def _seeds(spec: Spec, cell: dict[str, Any]) -> Sequence[int]:
     return cell.get("seeds", spec.seeds)
 
 
-def _with_task(spec: Spec, cell: dict[str, Any]) -> dict[str, Any]:
-    """The cell of a training. Raises PdkitError where it has no task or no test."""
-    if not isinstance(cell.get("task"), str):
+def _with_task(spec: Spec, cell: dict[str, Any], options: Sequence[str]) -> dict[str, Any]:
+    """The cell of a training. Raises PdkitError where it has no task, or an option of the wrong kind."""
+    if "task" not in cell:
         raise PdkitError(f"{spec.path.name}: a training needs a task, such as task = \"Door\".")
-    if type(cell["episodes"]) is not int or cell["episodes"] < 1:
-        raise PdkitError(f"{spec.path.name}: episodes must be a whole number of at least 1, not {cell['episodes']!r}.")
+    for name in options:
+        value = cell.get(name, 1 if name in NUMBERS else "")
+        if name in NUMBERS and (type(value) is not int or value < 1):
+            raise PdkitError(f"{spec.path.name}: {name} must be a whole number of at least 1, not {value!r}.")
+        if name not in NUMBERS and not isinstance(value, str):
+            raise PdkitError(f"{spec.path.name}: {name} must be a word in quotes, not {value!r}.")
     return cell
 
 
 def _training(spec: Spec, cell: dict[str, Any], seed: int) -> Job:
-    cell = _with_task(spec, DEFAULTS | cell)
+    cell = _with_task(spec, DEFAULTS | cell, OPTIONS)
     settings = {name: value for name, value in cell.items() if name not in OPTIONS}
     base = ROOT / cell["base"] if "base" in cell else base_folder(cell["method"], cell["task"])
     config = method_config(cell["method"], cell["task"], cell["profile"], seed, policy=load_policy(base), **settings)
@@ -186,14 +192,17 @@ def _training(spec: Spec, cell: dict[str, Any], seed: int) -> Job:
 
 
 def _imitation(spec: Spec, cell: dict[str, Any], seed: int) -> Job:
-    cell = _with_task(spec, BASE_DEFAULTS | cell)
+    cell = _with_task(spec, BASE_DEFAULTS | cell, BASE_OPTIONS)
     settings = {name: value for name, value in cell.items() if name not in (*BASE_OPTIONS, "recipe")} | {"seed": seed}
-    config, _ = configured(cell["policy"], settings)
+    config, architecture = configured(cell["policy"], settings)
+    made_of = untrained(cell["policy"], get_task(cell["task"]), architecture).config
     demos = sources.given(cell["task"], ROOT / cell["demos"]) if "demos" in cell else sources.bundled(cell["task"])
-    demos.first(cell.get("num_demos", demos.num))  # refuses more than there are
+    demos = demos.first(cell.get("num_demos", demos.num))
     words = ["train", "base", *_options(BASE_OPTIONS, cell), *_set(settings)]
     return _job(spec, cell | {"seed": seed}, {"task": cell["task"], "recipe": cell["recipe"], "seed": seed}, words,
-                like=f"{cell['task']} {cell['policy']}", config=asdict(config), minutes=spec.minutes)
+                like=f"{cell['task']} {cell['policy']}", minutes=spec.minutes,
+                config=asdict(config) | {name: value for name, value in made_of.items() if name not in POLICIES[cell["policy"]].made}
+                | {"demos_checksum": demos.checksum})
 
 
 def _options(names: Sequence[str], cell: dict[str, Any]) -> list[str]:

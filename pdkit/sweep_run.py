@@ -1,8 +1,9 @@
 """Running many jobs side by side: what one job loses, the others keep.
 
 A job is a `pdkit` command in a folder of its own. It is finished when its result.json is there, which is written atomically
-and last; so a second go skips what is finished, and what was interrupted resumes from its own checkpoint. The same job
-function runs in processes of this machine (`Local`) or on Ray (pdkit/sweep_ray.py). Nothing heavy is imported here: every worker does.
+and last; so a second go skips what is finished, and what was interrupted resumes from its own checkpoint (imitation, which takes
+minutes, begins anew). The same job function runs in processes of this machine (`Local`) or on Ray (pdkit/sweep_ray.py). Nothing heavy
+is imported here: every worker does.
 """
 from __future__ import annotations
 
@@ -45,7 +46,7 @@ class Job:
     words: tuple[str, ...]  # arguments of pdkit, without --out
     folder: Path  # its name holds a hash of the parameters
     parameters: dict[str, Any]
-    config: dict[str, Any] = field(default_factory=dict)  # everything that these parameters amount to today (train)
+    config: dict[str, Any] = field(default_factory=dict)  # everything that these parameters amount to today (not of a notebook)
     like: str = ""  # jobs that are alike take alike long: a method, a notebook
     minutes: float | None = None  # expected
 
@@ -99,11 +100,11 @@ def _trained(job: Job, out: Path) -> dict[str, Any]:
 
 
 def _imitated(job: Job, out: Path) -> dict[str, Any]:
-    info = read_json(out / "policy.json")["info"]
-    selected = info["selected"]
-    row = {"policy": job.parameters["policy"], "demos": info["demos"], "train_minutes": round(selected["seconds"] / 60, 2),
-           "cores": info["machine"]["cores"], "iteration": selected["iteration"], **info["test"]}
-    return {"row": row, "curve": [], "settings": info["imitate"]}
+    card = read_json(out / "policy.json")
+    info = card["info"]
+    row = {"policy": card["kind"], "demos": info["demos"], "train_minutes": round(info["seconds"] / 60, 2),
+           "cores": info["machine"]["cores"], "device": info["device"], "iteration": info["selected"]["iteration"], **info["test"]}
+    return {"row": row, "curve": [], "settings": info["imitate"] | card["config"] | {"demos_checksum": info["demos_checksum"]}}
 
 
 def _played(job: Job, out: Path) -> dict[str, Any]:

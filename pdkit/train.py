@@ -19,7 +19,7 @@ from .demos import Demos, sources
 from .demos.cli import Progress
 from .errors import PdkitError
 from .evaluate import evaluate
-from .files import DATA, atomic_file, runs_root
+from .files import DATA, atomic_file, runs_root, write_json
 from .imitate import configured, imitate
 from .methods import METHODS
 from .methods.registry import base_folder as shipped_base
@@ -123,16 +123,18 @@ def _base(args) -> int:
         policy, history = imitate(args.policy, demos, config, architecture, device=device, progress=show)
     best = max(history, key=lambda row: row.get("success_once", row["iteration"]))
     info = {"task": args.task, "demos": demos.num, "demos_checksum": demos.checksum, "label": demos.label, "imitate": asdict(config),
-            "selected": best, "command": "pdkit train " + " ".join(sys.argv[2:]), "device": device, "machine": describe_machine()}
-    if args.episodes:
-        spec = pixel_spec(get_task(args.task), encoder) if encoder else get_task(args.task)
-        info["test"] = {"episodes": args.episodes} | _outcome("base", _episodes(policy.to("cpu"), spec, args.episodes))
-        print("  " + ", ".join(f"{k} {v}" for k, v in info["test"].items()), flush=True)
+            "selected": best, "seconds": history[-1]["seconds"], "command": "pdkit train " + " ".join(sys.argv[2:]), "device": device,
+            "machine": describe_machine()}
     if args.pixels:
         save_visual(policy, encoder, out, info)
     else:
         save_policy(policy, out, info)
-    print(f"wrote {out}")
+    print(f"wrote {out}", flush=True)
+    if args.episodes:  # after the policy is safe
+        spec = pixel_spec(get_task(args.task), encoder) if encoder else get_task(args.task)
+        test = {"episodes": args.episodes} | _outcome("base", _episodes(load_policy(out), spec, args.episodes))
+        write_json(out / "policy.json", read_card(out) | {"info": info | {"test": test}})
+        print("  " + ", ".join(f"{k} {v}" for k, v in test.items()), flush=True)
     return 0
 
 

@@ -34,7 +34,9 @@ def table():
 
 def test_what_is_not_recorded_is_told_and_empty(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(recorded, "DATA", tmp_path)
-    (tmp_path / "results").mkdir()
+    for path in ("results", "sweeps"):
+        (tmp_path / path).mkdir()
+    (tmp_path / "sweeps" / "ablations.toml").touch()
     rows, curves = compare.available("ablations")
     assert rows.empty and curves.empty and "pdkit sweep data/sweeps/ablations.toml" in capsys.readouterr().out
     runs("a", [0.5]).to_csv(tmp_path / "results" / "ablations.csv", index=False)
@@ -60,6 +62,18 @@ def test_scores_take_the_seeds_that_all_tasks_have():
     assert set(compare.shared(table).recipe) == {"a"} and len(compare.shared(table)) == 5
     with pytest.raises(PdkitError, match="No seed of b .* all of Door, Pen"):
         compare.scores(table, "b", "decorated_success")
+    own = pd.concat([runs("policy_decorator", [0.5]), runs("rot", [0.1]), runs("ppo_decorator", [0.2], task="Pen")])
+    assert set(compare.shared(own).recipe) == {"policy_decorator", "rot"}  # Pen, without the decorator, is another comparison
+
+
+def test_both_forms_are_compared_on_the_seeds_that_they_share():
+    """An interrupted sweep: the original has two seeds more, better ones."""
+    table = pd.concat([runs("bet", [0] * 5, base=[0.5, 0.6, 0.4, 0.9, 0.9]), runs("bet-sac", [0] * 3, base=[0.6, 0.7, 0.5])]).assign(demos=5)
+    row, = compare.forms(table).to_dict("records")
+    assert row == {"task": "Door", "demonstrations": 5, "seeds": 3, "original, %": "50", "modified, %": "60",
+                   "modified less original, points": "+10 (+10 to +10)"}
+    with pytest.raises(PdkitError, match="bet_forms.toml"):
+        compare.forms(table[table.recipe == "bet"])
 
 
 # ---- comparisons -----------------------------------------------------------------------------------------------------

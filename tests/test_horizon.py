@@ -259,7 +259,7 @@ def test_the_sweep_varies_the_horizon_alone():
 
 @pytest.mark.parametrize(("solved", "verdict"), [
     ([0, 0, 30], "reproduced"), ([0, 30, 15], "partly"), ([3, 4, 5], "partly"), ([5, 4, 5], "not"), ([30, 10, 0], "not"), ([5], "untested"),
-    ([0, 0, 1], "untested")])
+    ([0, 0, 1], "untested"), ([1, 30, 1], "not")])
 def test_exploration_verdict(solved, verdict):
     table = pd.DataFrame({"start_fraction": [0.0, 0.5, 0.9][: len(solved)], "episodes": 40, "solved": solved})
     found, reasons = analysis.exploration_verdict(table.iloc[::-1])
@@ -296,11 +296,15 @@ def test_figures_draw_what_they_are_given():
     line = next(x for x in figure.axes[0].lines if x.get_label() == "tuned")
     np.testing.assert_allclose(line.get_ydata(), [0.2, 0.6])
     mine = analysis.by_fraction(pd.DataFrame({"recipe": ["policy_decorator,start_fraction=0.9"], "base_success": 0.5, "env_steps": 600,
-                                              "decorated_success": 0.75, "first_reward_step": np.nan}))
+                                              "episodes": 2, "decorated_success": 0.75, "first_reward_step": np.nan}))
     star = [x for x in plots_horizon.sweep_figure(done, "gain", labels, trained=mine).axes[0].lines if x.get_marker() == "*"]
-    assert [(*x.get_xdata(), *x.get_ydata(), x.get_label()) for x in star] == [(pytest.approx(0.1), 0.25, "your run, decorated, 600 steps")]
+    said = "your run, decorated, 600 steps, 2 episodes"
+    assert [(*x.get_xdata(), *x.get_ydata(), x.get_label()) for x in star] == [(pytest.approx(0.1), 0.25, said)]
     never = plots_horizon.sweep_figure(done, "first_reward_step", labels, trained=mine, budget=20_000).axes[0].lines
-    assert next(x for x in never if "your run" in x.get_label()).get_marker() == "^"
+    never, = (x for x in never if "your run" in x.get_label())
+    assert never.get_marker() == "^" and list(never.get_ydata()) == [600]
+    alone = plots_horizon.sweep_figure(done[done.method == "sac_finetune"], "gain", labels, trained=mine).axes[0]
+    assert [x.get_marker() for x in alone.lines if "your run" in x.get_label()] == ["*"]
     first = plots_horizon.sweep_figure(done, "first_reward_step", labels, budget=20_000)
     assert sum(list(x.get_ydata()) == [20_000] * 2 for x in first.axes[0].lines) == 4  # two runs of each method and start: no reward
     met = pd.DataFrame({"who": "a", "start_fraction": [0.0, 0.9], "episodes": 10, "solved": [0, 5], "steps": [900, 100],

@@ -243,6 +243,12 @@ def test_the_folder_follows_every_parameter_and_nothing_else(tmp_path):
     (BASE | {"grid": {"iterrations": [3]}}, "Did you mean 'iterations'?"),
     (BASE | {"grid": {"batch": ["big"]}, "fixed": {"task": "Door"}}, "batch must be of type int"),
     (BASE | {"fixed": {"task": "Door", "num_demos": 99}}, "99"),
+    (BASE | {"fixed": {"task": "Door", "num_demos": "5"}}, "num_demos must be a whole number of at least 1, not '5'"),
+    (BASE | {"fixed": {"task": "Door", "num_demos": True}}, "num_demos must be a whole number"),
+    (BASE | {"fixed": {"task": "Door", "demos": 3}}, "demos must be a word in quotes, not 3"),
+    (BASE | {"grid": {}, "cells": [{"policy": ["bet"], "recipe": "x"}]}, "policy must be a word in quotes"),
+    (BASE | {"grid": {"policy": ["bet"], "embed": ["big"]}}, "bet's embed must be a whole number"),
+    (BASE | {"grid": {"policy": ["vinn"], "rows": [3]}}, "Unknown field 'rows'"),
     (BASE | {"fixed": {"task": "Door", "episodes": 0}}, "episodes must be a whole number"),
     (BOOK | {"fixed": {}}, "needs notebook"),
     (BOOK | {"fixed": {"notebook": "99"}}, "Unknown notebook '99'"),
@@ -459,8 +465,10 @@ def test_base_policies_are_trained_and_tested_and_what_they_solve_becomes_a_row(
     monkeypatch.setattr(Local, "start", None)  # nothing may start again
     assert cli.main(["sweep", str(path)]) == 0 and "2 jobs, 2 finished, 0 to do" in capsys.readouterr().out
     result = read_json(one.result)
-    write_json(one.result, result | {"settings": result["settings"] | {"lr": 0.5}})
-    assert cli.main(["sweep", str(path)]) == 2 and "with other values of lr than" in capsys.readouterr().err
+    assert result["row"]["device"] in ("cpu", "cuda") and set(one.config) <= set(result["settings"])
+    for name, then in (("lr", 0.5), ("hidden", 7), ("demos_checksum", "another file's")):
+        write_json(one.result, result | {"settings": result["settings"] | {name: then}})
+        assert cli.main(["sweep", str(path)]) == 2 and f"with other values of {name} than" in capsys.readouterr().err
 
 
 # ---- Ray -------------------------------------------------------------------------------------------------------------

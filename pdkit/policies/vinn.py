@@ -39,6 +39,7 @@ class VINN(Policy):
     learns = False
     defaults: dict[str, Any] = dict(k=5, exclusion=0, tolerance=1, history=20, representation="raw", rows=0)
     least = dict(exclusion=0, rows=0)
+    made = ("rows",)  # by `remember`
 
     def __init__(self, config: dict[str, Any]):
         super().__init__(config | {"representation": "raw"})
