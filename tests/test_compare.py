@@ -68,7 +68,8 @@ def test_scores_take_the_seeds_that_all_tasks_have():
 
 def test_both_forms_are_compared_on_the_seeds_that_they_share():
     """An interrupted sweep: the original has two seeds more, better ones."""
-    table = pd.concat([runs("bet", [0] * 5, base=[0.5, 0.6, 0.4, 0.9, 0.9]), runs("bet-sac", [0] * 3, base=[0.6, 0.7, 0.5])]).assign(demos=5)
+    table = pd.concat([runs("bet", [0] * 5, base=[0.5, 0.6, 0.4, 0.9, 0.9]), runs("bet-sac", [0] * 3, base=[0.6, 0.7, 0.5])])
+    table["demos"] = 5
     row, = compare.forms(table).to_dict("records")
     assert row == {"task": "Door", "demonstrations": 5, "seeds": 3, "original, %": "50", "modified, %": "60",
                    "modified less original, points": "+10 (+10 to +10)"}
