@@ -13,7 +13,8 @@ Every verdict follows one of few rules, so that no one is tempted to choose the 
   over the tasks; where their own means lie on different sides the verdict is **partly**, whatever the mean;
 - where the claim names tasks, those of them that are recorded are judged alone, and the others told beside them; where it names more
   than were run, "reproduced" counts as **partly**;
-- fewer than three seeds are no test, and neither are two sides that both solve hardly anything: the budget does not tell them apart.
+- fewer than three seeds are no test, and neither are two sides that both solve hardly anything: the budget does not tell them apart (of
+  several tasks, that one is left out and told beside the others).
 """
 from __future__ import annotations
 
@@ -131,9 +132,13 @@ def on_tasks(values: pd.Series, tasks: Sequence[str]) -> pd.Series:
     return values[values.index.get_level_values("task").isin(tasks)]
 
 
+def _tasks(values: pd.Series) -> set[str]:
+    return set(values.index.get_level_values("task"))
+
+
 def named_by(paper: Sequence[str], values: pd.Series) -> tuple[pd.Series, pd.Series]:
     """Of values by (task, seed) those to judge, on tasks that the claim names (all, where it names none of them), and the others."""
-    tasks = set(values.index.get_level_values("task"))
+    tasks = _tasks(values)
     chosen = tasks & set(paper) or tasks
     return on_tasks(values, chosen), on_tasks(values, tasks - chosen)
 
@@ -155,10 +160,14 @@ def undisturbed(table: pd.DataFrame) -> pd.DataFrame:
     return table[table.load_average <= table.cores + 1]
 
 
-def told_apart(*sides: pd.Series) -> None:
-    """Raises TooLittle when no side solves anything to speak of."""
-    if max(average(side) for side in sides) < FLOOR:
+def told_apart(*sides: pd.Series) -> tuple[pd.Series, ...]:
+    """The same runs by (task, seed) on those tasks on which at least one side solves something to speak of: where all are near 0, the
+    budget does not tell them apart. Raises TooLittle where there is no such task."""
+    best_of = pd.concat([side.groupby(level="task").mean() for side in sides], axis=1).max(axis=1)
+    able = best_of.index[best_of >= FLOOR]
+    if able.empty:
         raise TooLittle("All sides end near 0: this budget does not tell them apart.")
+    return tuple(on_tasks(side, able) for side in sides)
 
 
 def best(table: pd.DataFrame, recipes: Sequence[str], column: str = "decorated_success") -> str:
@@ -248,10 +257,12 @@ def compared(record: str, first: str, second: str = "", *, column: str = "decora
 def set_against(record: str | Sequence[str], one: pd.Series, two: pd.Series, names: tuple[str, str], *, sign: int = 1, enough: float = 0.0,
                 paper: Sequence[str] = ()) -> Finding:
     """The same for runs by (task, seed), from wherever; `names` says what both are called."""
-    told_apart(one, two)
-    values, others = named_by(paper, difference(*matched(one, two))[1])
+    both = matched(one, two)
+    one, two = told_apart(*both)
+    near_0 = [f"{task} (both near 0)" for task in sorted(_tasks(both[0]) - _tasks(one))]
+    values, others = named_by(paper, difference(one, two)[1])
     interval, one, two = mean_interval(values), one.loc[values.index], two.loc[values.index]
-    beside = ", ".join(f"{task} {signed(mean)}" for task, mean in others.groupby(level="task").mean().items())
+    beside = ", ".join([f"{task} {signed(mean)}" for task, mean in others.groupby(level="task").mean().items()] + near_0)
     told = (f"{names[0]} {percent(average(one))}, {names[1]} {percent(average(two))}: {signed(interval.value)} points"
             f"{task_by_task(values, signed)}{f'; not judged: {beside}' if beside else ''}")
     return finding(record, values, told, points(interval), judged_over_tasks(sign * values, enough), paper)

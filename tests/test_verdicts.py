@@ -75,6 +75,24 @@ def test_two_seeds_are_no_test(results):
         assert (verdicts.find("Policy Decorator substantially improves a low-performing BeT checkpoint.") is not None) == known
 
 
+def test_a_task_on_which_both_sides_end_near_0_is_left_out_and_told(results):
+    """It would halve a difference seen on the other task, and count against the paper as "not above"."""
+    claim = CLAIMS.claim[CLAIMS.claim.str.startswith("A large GPT actor does worse")].item()
+
+    def found(cube):
+        write(results, "calql", runs("calql_c", [0.9, 0.8, 0.85]), runs("calql_d", [0.1, 0.0, 0.2]))
+        write(results, "calql_stackcube", runs("calql_c", cube[0], task="StackCube"), runs("calql_d", cube[1], task="StackCube"))
+        return verdicts.find(claim)
+
+    alone = found(([0, 0, 0.05], [0, 0.02, 0]))
+    assert (alone.tasks, alone.verdict) == ("Door", "reproduced")
+    assert alone.measured.endswith("-75.0 points; not judged: StackCube (both near 0)")
+    assert found(([0, 0, 0.05], [0.3, 0.2, 0.3])).verdict == "partly" and found(([0, 0, 0.05], [0.3, 0.2, 0.3])).tasks == "Door StackCube"
+    zero = pd.Series([0.01] * 3, pd.MultiIndex.from_product([["Door"], range(3)], names=["task", "seed"]))
+    with pytest.raises(claims.TooLittle):
+        claims.told_apart(zero, zero)
+
+
 def test_three_seeds_are_asked_of_every_task():
     """One seed in each of three tasks is no test, and a task with one seed is left out beside one with three."""
     one_each = pd.concat([runs("x", [0.5], task=task) for task in ("Door", "Pen", "Hammer")])

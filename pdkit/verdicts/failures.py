@@ -8,7 +8,6 @@ import numpy as np
 import pandas as pd
 
 from ..claims import (
-    FLOOR,
     METHOD,
     Finding,
     TooLittle,
@@ -50,8 +49,8 @@ def _() -> Finding:
     table, curves = recorded("leaderboard")
     ends, ways = ([of(recipe) for recipe in ("calql", "sac_finetune")] for of in (
         lambda recipe: by_seed(table, recipe, "decorated_success"), lambda recipe: efficiency(curves, recipe)))
-    told_apart(*ends, *ways)
-    ends, ways = matched(*ends), matched(*ways)
+    *ends, one, two = told_apart(*ends, *ways)
+    ends, ways = matched(*ends), matched(one, two)
     (end, values), (way, over) = difference(*ends), difference(*ways)
     at_end, on_the_way = (", ".join(percent(average(side)) for side in sides) for sides in (ends, ways))
     return finding("leaderboard", values, f"Cal-QL and SAC fine-tuning: at the end {at_end}; over all evaluations {on_the_way}",
@@ -62,9 +61,7 @@ def _() -> Finding:
 def _efficiency(first: str, second: str) -> tuple[Interval, pd.Series, str]:
     """Difference of the mean success over all evaluations of the online stage; and in words."""
     _, curves = recorded("calql")
-    one, two = efficiency(curves, first), efficiency(curves, second)
-    told_apart(one, two)
-    one, two = matched(one, two)
+    one, two = matched(*told_apart(efficiency(curves, first), efficiency(curves, second)))
     interval, values = difference(one, two)
     return interval, values, (f"mean success over the online evaluations {percent(average(one))} and {percent(average(two))}"
                               f"{task_by_task(values, signed)}")
@@ -189,13 +186,10 @@ def _() -> Finding:
 
 @measures("The BeT modified for fine-tuning")
 def _() -> Finding:
-    """Like the original: the mean difference, with its interval, lies within 10 points (ours), and no task's own mean beyond them. Tasks on
-    which neither form solves anything to speak of do not count."""
+    """Like the original: the mean difference, with its interval, lies within 10 points (ours), and no task's own mean beyond them."""
     table, _ = recorded("bet_forms")
-    ours, theirs = matched(*(by_seed(table, form, "base_success") for form in ("bet-sac", "bet")))
-    told_apart(ours, theirs)
-    able = [task for task, success in np.maximum(ours, theirs).groupby(level="task").mean().items() if success >= FLOOR]
-    interval, values = difference(on_tasks(ours, able), on_tasks(theirs, able))
+    ours, theirs = matched(*told_apart(*(by_seed(table, form, "base_success") for form in ("bet-sac", "bet"))))
+    interval, values = difference(ours, theirs)
     ours, theirs = ours.loc[values.index], theirs.loc[values.index]
     beyond = values.groupby(level="task").mean().abs().max() >= 0.1
     inside = -0.1 < interval.low and interval.high < 0.1 and not beyond
@@ -244,9 +238,9 @@ def _() -> Finding:
         moved = rows[rows.updates > waits].assign(age=(rows.updates - waits) // 100)
         arms[recipe] = moved.set_index(["task", "seed", "age"]).success_once
     both = pd.concat(arms, axis=1, join="inner").groupby(["task", "seed"]).mean()
-    interval, values = difference(both["vanilla"], both["warm-fixed"])
-    plain, warm = both["vanilla"].loc[values.index], both["warm-fixed"].loc[values.index]
-    told_apart(plain, warm)
+    plain, warm = told_apart(both["vanilla"], both["warm-fixed"])
+    interval, values = difference(plain, warm)
+    plain, warm = plain.loc[values.index], warm.loc[values.index]
     told = (f"mean success at equal numbers of the actor's updates: without {percent(average(plain))}, with a warm start and a fixed "
             f"temperature {percent(average(warm))}: {signed(interval.value)} points{task_by_task(values, signed)}")
     return finding("warm_finetuning", values, told, points(interval), judged_over_tasks(values))
@@ -295,7 +289,7 @@ def _() -> Finding:
     """Share of episodes with a reward under random actions: higher from the latest start than on the whole task."""
     rows, rates = _numbered("met.random actions.")
     whole, late = (by_seed(rows, "x", rates[end]) for end in (min(rates), max(rates)))
-    told_apart(whole, late)
+    whole, late = told_apart(whole, late)
     interval, values = difference(late, whole)
     told = ", ".join(f"{f:g}: {percent(average(by_seed(rows, 'x', name)))}" for f, name in rates.items())
     return finding("exploration", values, f"episodes with a reward under random actions, by the share of the way that lies behind: {told}",
