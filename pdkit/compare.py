@@ -160,14 +160,16 @@ def _text(value: float, low: float = np.nan, high: float = np.nan, scale: float 
 
 
 def forms(table: pd.DataFrame) -> pd.DataFrame:
-    """The paper's Table 10 from rows of data/results/bet_forms.csv, as text, a row a task: how often the original Behavior Transformer
-    succeeds and the one that SAC can fine-tune, and the difference seed by seed, over the seeds of both. Raises PdkitError without any."""
-    rows, names = [], ["bet", "bet-sac"]
-    for task, part in table.groupby("task"):
-        pairs = part.pivot(index="seed", columns="recipe", values="base_success").reindex(columns=names).dropna()
-        both = part[part.seed.isin(pairs.index)]
-        original, modified = (_text(pairs[name].mean(), scale=100) for name in names)
-        rows += [{"task": task, "demonstrations": both.demos.iloc[0], "seeds": row.seeds, "original, %": original, "modified, %": modified,
+    """The paper's Table 10 from rows of data/results/bet_forms.csv, as text, a row a task and a number of gradient steps: how often the
+    original Behavior Transformer succeeds and the one that SAC can fine-tune, and the difference seed by seed, over the seeds of both.
+    Raises PdkitError without any."""
+    rows = []
+    for (task, steps), part in table.groupby(["task", "iteration"]):
+        pairs = part.pivot(index="seed", columns="policy", values="base_success").reindex(columns=["bet", "bet-sac"]).dropna()
+        both = part[part.seed.isin(pairs.index)].assign(recipe=lambda t: t.policy)
+        original, modified = (_text(pairs[name].mean(), scale=100) for name in pairs)
+        rows += [{"task": task, "demonstrations": both.demos.iloc[0], "gradient steps": f"{steps:,}", "seeds": row.seeds,
+                  "original, %": original, "modified, %": modified,
                   "modified less original, points": _text(row.value, row.low, row.high, scale=100, form="+.0f")}
                  for row in differences(both, {"bet-sac": ""}, "bet", "base_success").itertuples()]
     if not rows:

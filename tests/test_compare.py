@@ -68,13 +68,14 @@ def test_scores_take_the_seeds_that_all_tasks_have():
 
 def test_both_forms_are_compared_on_the_seeds_that_they_share():
     """An interrupted sweep: the original has two seeds more, better ones."""
-    table = pd.concat([runs("bet", [0] * 5, base=[0.5, 0.6, 0.4, 0.9, 0.9]), runs("bet-sac", [0] * 3, base=[0.6, 0.7, 0.5])])
-    table["demos"] = 5
-    row, = compare.forms(table).to_dict("records")
-    assert row == {"task": "Door", "demonstrations": 5, "seeds": 3, "original, %": "50", "modified, %": "60",
+    table = pd.concat([runs("x", [0] * 5, policy="bet", base=[0.5, 0.6, 0.4, 0.9, 0.9]),
+                       runs("y", [0] * 3, policy="bet-sac", base=[0.6, 0.7, 0.5])]).assign(demos=5, iteration=1_400)
+    alone = runs("x", [0] * 3, policy="bet").assign(demos=5, iteration=80)  # of another number of steps one form only
+    row, = compare.forms(pd.concat([table, alone])).to_dict("records")
+    assert row == {"task": "Door", "demonstrations": 5, "gradient steps": "1,400", "seeds": 3, "original, %": "50", "modified, %": "60",
                    "modified less original, points": "+10 (+10 to +10)"}
     with pytest.raises(PdkitError, match="bet_forms.toml"):
-        compare.forms(table[table.recipe == "bet"])
+        compare.forms(alone)
 
 
 # ---- comparisons -----------------------------------------------------------------------------------------------------
