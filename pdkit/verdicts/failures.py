@@ -239,12 +239,8 @@ def _() -> Finding:
         moved = rows[rows.updates > waits].assign(age=(rows.updates - waits) // 100)
         arms[recipe] = moved.set_index(["task", "seed", "age"]).success_once
     both = pd.concat(arms, axis=1, join="inner").groupby(["task", "seed"]).mean()
-    plain, warm = told_apart(both["vanilla"], both["warm-fixed"])
-    interval, values = difference(plain, warm)
-    plain, warm = plain.loc[values.index], warm.loc[values.index]
-    told = (f"mean success at equal numbers of the actor's updates: without {percent(average(plain))}, with a warm start and a fixed "
-            f"temperature {percent(average(warm))}: {signed(interval.value)} points{task_by_task(values, signed)}")
-    return finding("warm_finetuning", values, told, points(interval), judged_over_tasks(values))
+    return set_against("warm_finetuning", both["vanilla"], both["warm-fixed"], (
+        "mean success at equal numbers of the actor's updates: without", "with a warm start and a fixed temperature"))
 
 
 @measures("With a warm start and a fixed entropy coefficient, the training of the critic is very unstable")
