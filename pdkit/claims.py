@@ -132,13 +132,9 @@ def on_tasks(values: pd.Series, tasks: Sequence[str]) -> pd.Series:
     return values[values.index.get_level_values("task").isin(tasks)]
 
 
-def _tasks(values: pd.Series) -> set[str]:
-    return set(values.index.get_level_values("task"))
-
-
 def named_by(paper: Sequence[str], values: pd.Series) -> tuple[pd.Series, pd.Series]:
     """Of values by (task, seed) those to judge, on tasks that the claim names (all, where it names none of them), and the others."""
-    tasks = _tasks(values)
+    tasks = set(values.index.get_level_values("task"))
     chosen = tasks & set(paper) or tasks
     return on_tasks(values, chosen), on_tasks(values, tasks - chosen)
 
@@ -160,14 +156,23 @@ def undisturbed(table: pd.DataFrame) -> pd.DataFrame:
     return table[table.load_average <= table.cores + 1]
 
 
-def told_apart(*sides: pd.Series) -> tuple[pd.Series, ...]:
-    """The same runs by (task, seed) on those tasks on which at least one side solves something to speak of: where all are near 0, the
-    budget does not tell them apart. Raises TooLittle where there is no such task."""
+def told_apart(*sides: pd.Series) -> tuple[tuple[pd.Series, ...], list[str]]:
+    """The runs by (task, seed) that all sides have, on tasks with three of them on which at least one side solves something to speak of;
+    and the tasks on which all are near 0: the budget does not tell them apart. Raises TooLittle where no task is left."""
+    sides = tuple(_of_enough_seeds(side) for side in matched(*sides))
+    if sides[0].empty:
+        raise TooLittle(f"Fewer than {LEAST_SEEDS} seeds are recorded on all sides.")
     best_of = pd.concat([side.groupby(level="task").mean() for side in sides], axis=1).max(axis=1)
     able = best_of.index[best_of >= FLOOR]
     if able.empty:
         raise TooLittle("All sides end near 0: this budget does not tell them apart.")
-    return tuple(on_tasks(side, able) for side in sides)
+    return tuple(on_tasks(side, able) for side in sides), list(best_of.index.difference(able))
+
+
+def not_judged(near_0: Sequence[str], others: Mapping[str, float] | None = None) -> str:
+    """What is told behind a finding of tasks that do not count: `others` with their differences, and those where all sides are near 0."""
+    told = [f"{task} {signed(mean)}" for task, mean in (others or {}).items()] + [f"{task} (all sides near 0)" for task in near_0]
+    return f"; not judged: {', '.join(told)}" if told else ""
 
 
 def best(table: pd.DataFrame, recipes: Sequence[str], column: str = "decorated_success") -> str:
@@ -257,14 +262,12 @@ def compared(record: str, first: str, second: str = "", *, column: str = "decora
 def set_against(record: str | Sequence[str], one: pd.Series, two: pd.Series, names: tuple[str, str], *, sign: int = 1, enough: float = 0.0,
                 paper: Sequence[str] = ()) -> Finding:
     """The same for runs by (task, seed), from wherever; `names` says what both are called."""
-    both = matched(one, two)
-    one, two = told_apart(*both)
-    near_0 = [f"{task} (both near 0)" for task in sorted(_tasks(both[0]) - _tasks(one))]
-    values, others = named_by(paper, difference(one, two)[1])
-    interval, one, two = mean_interval(values), one.loc[values.index], two.loc[values.index]
-    beside = ", ".join([f"{task} {signed(mean)}" for task, mean in others.groupby(level="task").mean().items()] + near_0)
+    one, two = matched(one, two)
+    chosen, others = named_by(paper, _of_enough_seeds(one))
+    (one, two), near_0, rest = *told_apart(one.loc[chosen.index], two.loc[chosen.index]), (one - two).loc[others.index]
+    interval, values = difference(one, two)
     told = (f"{names[0]} {percent(average(one))}, {names[1]} {percent(average(two))}: {signed(interval.value)} points"
-            f"{task_by_task(values, signed)}{f'; not judged: {beside}' if beside else ''}")
+            f"{task_by_task(values, signed)}{not_judged(near_0, rest.groupby(level='task').mean().to_dict())}")
     return finding(record, values, told, points(interval), judged_over_tasks(sign * values, enough), paper)
 
 

@@ -86,11 +86,37 @@ def test_a_task_on_which_both_sides_end_near_0_is_left_out_and_told(results):
 
     alone = found(([0, 0, 0.05], [0, 0.02, 0]))
     assert (alone.tasks, alone.verdict) == ("Door", "reproduced")
-    assert alone.measured.endswith("-75.0 points; not judged: StackCube (both near 0)")
+    assert alone.measured.endswith("-75.0 points; not judged: StackCube (all sides near 0)")
     assert found(([0, 0, 0.05], [0.3, 0.2, 0.3])).verdict == "partly" and found(([0, 0, 0.05], [0.3, 0.2, 0.3])).tasks == "Door StackCube"
     zero = pd.Series([0.01] * 3, pd.MultiIndex.from_product([["Door"], range(3)], names=["task", "seed"]))
-    with pytest.raises(claims.TooLittle):
+    with pytest.raises(claims.TooLittle, match="near 0"):
         claims.told_apart(zero, zero)
+    with pytest.raises(claims.TooLittle, match="Fewer than 3 seeds"):
+        claims.told_apart(zero + 1, (zero + 1)[:2])
+
+
+def test_where_the_named_task_is_near_0_no_other_is_judged_for_it(results):
+    """D.3 names Pen."""
+    rows = [runs("ppo_decorator", [0.1, 0.1, 0.1]), runs("ppo_finetune", [0.5, 0.6, 0.5])]
+    claim = CLAIMS.claim[CLAIMS.claim.str.startswith("Policy Decorator with PPO considerably outperforms PPO")].item()
+    for pen, tasks in (([0.5, 0.4, 0.6], "Pen"), ([0.0, 0.0, 0.01], None)):
+        write(results, "leaderboard", *rows, runs("ppo_decorator", pen, task="Pen"), runs("ppo_finetune", [0.0] * 3, task="Pen"))
+        found = verdicts.find(claim)
+        assert (found.tasks if found else None) == tasks
+    write(results, "leaderboard", *rows)
+    assert verdicts.find(claim).tasks == "Door"  # Pen was not run
+
+
+def test_a_task_on_which_neither_learns_counts_where_the_claim_is_of_the_end(results):
+    """C must exceed 90 % at the end, also where B and C are both at 0 all the way."""
+    claim = CLAIMS.claim[CLAIMS.claim.str.startswith("SAC in place of Cal-QL online costs slightly")].item()
+    door = [curve("calql_b", [0.9] * 3, [0.9] * 3), curve("calql_c", [0.9] * 3, [0.95] * 3)]
+    write(results, "calql", runs("calql_b", [0.95] * 3), runs("calql_c", [0.96, 0.97, 0.98]), curves=pd.concat(door))
+    assert verdicts.find(claim).verdict == "reproduced"
+    cube = pd.concat([curve(name, [0.0] * 3, [0.0] * 3) for name in ("calql_b", "calql_c")]).assign(task="StackCube")
+    write(results, "calql_stackcube", *(runs(name, [0.0] * 3, task="StackCube") for name in ("calql_b", "calql_c")), curves=cube)
+    found = verdicts.find(claim)
+    assert found.verdict == "partly" and "StackCube 0.0 %" in found.measured and "not judged: StackCube" in found.measured
 
 
 def test_three_seeds_are_asked_of_every_task():
