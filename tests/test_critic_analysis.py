@@ -181,7 +181,10 @@ def curve_rows(recipes, successes=(0.2, 0.6, 0.4), seeds=3):
 
 def test_joined_takes_e_from_the_leaderboard_and_only_there(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(recorded, "DATA", tmp_path)
-    (tmp_path / "results").mkdir()
+    for folder in ("results", "sweeps"):
+        (tmp_path / folder).mkdir()
+    for name in ("calql", "leaderboard", "calql_stackcube"):
+        (tmp_path / "sweeps" / f"{name}.toml").touch()
     table, curves = calql_analysis.joined()
     assert table.empty and curves.empty and capsys.readouterr().out.count("pdkit sweep") == 2
 

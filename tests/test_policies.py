@@ -153,7 +153,7 @@ BAD = [  # policy, setting as typed, what the sentence must name
     ("rnn", "window=0", "at least 1"), ("rnn", "layers=0", "at least 1"), ("rnn", "hidden=1.5", "a whole number"),
     ("cnn", "window=0", "at least 1"), ("cnn", "layers=0", "at least 1"), ("cnn", "kernel=2", "odd"), ("cnn", "hidden=-1", "at least 1"),
     ("vinn", "k=0", "at least 1"), ("vinn", "k=x", "a whole number"), ("vinn", "exclusion=-1", "at least 0"),
-    ("vinn", "rows=-1", "at least 0"), ("vinn", "tolerance=0", "at least 1"), ("vinn", "history=0", "at least 1"),
+    ("vinn", "rows=3", "Unknown field 'rows'"), ("vinn", "tolerance=0", "at least 1"), ("vinn", "history=0", "at least 1"),
     ("vinn", "representation=3", "raw"), ("vinn", "representation={}", "raw"),
     ("zero", "chunk=0", "at least 1"), ("zero", "window=[]", "a whole number"),
 ]
