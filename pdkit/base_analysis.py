@@ -23,7 +23,7 @@ from .demos.format import Demos
 from .errors import PdkitError
 from .evaluate import evaluate
 from .gradient_steps import gradient_step, make_optimizer
-from .imitate import ImitateConfig, Windows, imitate
+from .imitate import ImitateConfig, Windows, imitate, untrained
 from .policies import POLICIES, Policy
 from .tasks.spec import TaskSpec
 
@@ -58,8 +58,7 @@ FAMILIES = {
 def fresh(family: Family, demos: Demos, spec: TaskSpec, seed: int = 0) -> Policy:
     """An untrained policy of a family with the demonstrations' statistics."""
     torch.manual_seed(seed)
-    kind = POLICIES[family.kind]
-    policy = kind({"obs_dim": spec.obs_dim, "act_dim": spec.act_dim} | kind.for_task(spec) | family.config)
+    policy = untrained(family.kind, spec, family.config)
     policy.fit_statistics(demos.observations, demos.actions, seed)
     return policy
 

@@ -22,7 +22,7 @@ from .demos import Demos
 from .demos.sources import bundled
 from .files import DATA, write_json
 from .gradient_steps import GradientSteps, gradient_step, make_optimizer
-from .imitate import ImitateConfig, Windows
+from .imitate import ImitateConfig, Windows, untrained
 from .pixel_analysis import backend, why_not
 from .pixels.sim import PixelSim
 from .policies import POLICIES
@@ -212,7 +212,7 @@ def bench_base(seconds: float) -> dict[str, Any]:
 def imitator(kind: str, demos: Demos, batch: int, device: str, shipped: bool) -> Callable[[], int]:
     """One call makes a gradient step of imitation: the shipped path, or a plain float32 loop with AdamW one tensor at a time."""
     spec, config = get_task(demos.task), ImitateConfig(batch=batch)
-    policy = POLICIES[kind](dict(obs_dim=spec.obs_dim, act_dim=spec.act_dim, **POLICIES[kind].for_task(spec)))
+    policy = untrained(kind, spec)
     policy.fit_statistics(demos.observations, demos.actions)
     policy.to(device).train()
     windows, generator = Windows(demos, policy.window, True, policy.horizon, spec.resting), torch.Generator().manual_seed(0)

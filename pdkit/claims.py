@@ -264,7 +264,8 @@ def set_against(record: str | Sequence[str], one: pd.Series, two: pd.Series, nam
     """The same for runs by (task, seed), from wherever; `names` says what both are called."""
     one, two = matched(one, two)
     chosen, others = named_by(paper, _of_enough_seeds(one))
-    (one, two), near_0, rest = *told_apart(one.loc[chosen.index], two.loc[chosen.index]), (one - two).loc[others.index]
+    rest = (one - two).loc[others.index]
+    (one, two), near_0 = told_apart(one.loc[chosen.index], two.loc[chosen.index])
     interval, values = difference(one, two)
     told = (f"{names[0]} {percent(average(one))}, {names[1]} {percent(average(two))}: {signed(interval.value)} points"
             f"{task_by_task(values, signed)}{not_judged(near_0, rest.groupby(level='task').mean().to_dict())}")

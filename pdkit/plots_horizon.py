@@ -100,8 +100,8 @@ def sweep_figure(table: pd.DataFrame, column: str, labels: dict[str, str], *, ow
     _columns(table, "method", "start_fraction", column)
     figure, axes = blank(size=(7.6, 4.2))
     ax = axes[0, 0]
-    seen = set(table.method) | set([] if trained is None else trained.method)
-    present = {method: name for method, name in labels.items() if method in seen}
+    drawn = pd.concat([runs[["method", "start_fraction"]] for runs in (table, trained) if runs is not None])
+    present = {method: name for method, name in labels.items() if method in set(drawn.method)}
     for i, (method, name) in enumerate(present.items()):
         rows, color, shift = table[table.method == method], PALETTE[i], 0.012 * (i - 1)
         known = rows.dropna(subset=[column])
@@ -122,7 +122,7 @@ def sweep_figure(table: pd.DataFrame, column: str, labels: dict[str, str], *, ow
         for who, rows in own.groupby("who", sort=False):
             ax.plot(1 - rows.start_fraction, rows.success, "--", marker="o", ms=6, mfc="white", lw=1.2, color=COLORS["base"],
                     alpha=1.0 if who == own.who.iloc[0] else 0.5, label=f"{who}, your run")
-    _horizons(ax, table.start_fraction if trained is None else [*table.start_fraction, *trained.start_fraction])
+    _horizons(ax, drawn.start_fraction)
     if budget:
         ax.plot([], [], "^", ms=7, mfc="white", color="0.3", label="no reward in the whole run")
         ax.set(yscale="log", ylabel=ylabel or column.replace("_", " "))

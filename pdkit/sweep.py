@@ -39,7 +39,7 @@ from typing import Any
 
 from . import nb
 from .cli import Parser
-from .demos import sources
+from .demos import Demos, sources
 from .errors import PdkitError, unknown
 from .files import ROOT, read_json, runs_root
 from .imitate import configured, untrained
@@ -184,7 +184,7 @@ def _training(spec: Spec, cell: dict[str, Any], seed: int) -> Job:
     base = ROOT / cell["base"] if "base" in cell else base_folder(cell["method"], cell["task"])
     config = method_config(cell["method"], cell["task"], cell["profile"], seed, policy=load_policy(base), **settings)
     if config.demo_fraction:
-        sources.given(cell["task"], ROOT / cell["demos"]) if "demos" in cell else sources.bundled(cell["task"])
+        _demos(cell)
     words = ["train", "decorated", *_options(OPTIONS, cell), "--seeds", str(seed), *_set(settings)]
     return _job(spec, cell | {"seed": seed}, {"task": cell["task"], "recipe": cell["recipe"], "seed": seed}, words, like=cell["method"],
                 config=flat(config) | {"base": read_card(base)["weights_sha256"]},
@@ -196,13 +196,18 @@ def _imitation(spec: Spec, cell: dict[str, Any], seed: int) -> Job:
     settings = {name: value for name, value in cell.items() if name not in (*BASE_OPTIONS, "recipe")} | {"seed": seed}
     config, architecture = configured(cell["policy"], settings)
     made_of = untrained(cell["policy"], get_task(cell["task"]), architecture).config
-    demos = sources.given(cell["task"], ROOT / cell["demos"]) if "demos" in cell else sources.bundled(cell["task"])
+    demos = _demos(cell)
     demos = demos.first(cell.get("num_demos", demos.num))
     words = ["train", "base", *_options(BASE_OPTIONS, cell), *_set(settings)]
     return _job(spec, cell | {"seed": seed}, {"task": cell["task"], "recipe": cell["recipe"], "seed": seed}, words,
                 like=f"{cell['task']} {cell['policy']}", minutes=spec.minutes,
                 config=asdict(config) | {name: value for name, value in made_of.items() if name not in POLICIES[cell["policy"]].made}
                 | {"demos_checksum": demos.checksum})
+
+
+def _demos(cell: dict[str, Any]) -> Demos:
+    """The demonstrations of a training. Raises PdkitError where there are none, or those of another task."""
+    return sources.given(cell["task"], ROOT / cell["demos"]) if "demos" in cell else sources.bundled(cell["task"])
 
 
 def _options(names: Sequence[str], cell: dict[str, Any]) -> list[str]:
