@@ -15,6 +15,7 @@ from pdkit.online import Trainer
 from pdkit.online_config import OnlineConfig
 from pdkit.policies import BeT, BeTForSAC, load_policy, save_policy
 from pdkit.probes import PROBES, biased_base
+from pdkit.tasks import TASKS
 from pdkit.unlearning import set_spread
 
 TINY = dict(window=3, bins=4, layers=1, heads=2, embed=16, features=16, dropout=0.0)
@@ -100,6 +101,32 @@ def test_every_method_has_a_configuration_in_every_profile(method):
     for profile in ("smoke", "lesson", "paper"):
         assert method_config(method, "Door", profile).method == method
     assert METHODS[method].source and METHODS[method].title
+
+
+@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("method", ["rot", "fish"])
+def test_under_a_reward_by_likeness_no_task_ends_an_episode_at_success(method, task):
+    assert method_config(method, task).on_success == "continue"
+
+
+def test_rlpd_has_the_numbers_of_the_original():
+    """facts.md 3.2, 5.3: all of them but what is told in methods/scratch.py."""
+    config = method_config("rlpd", "Door", "paper")
+    sac = config.sac
+    assert (sac.num_critics, sac.target_subset, sac.actor_value, sac.entropy_backup) == (10, 2, "mean", False)
+    assert (sac.critic_layer_norm, sac.target_entropy_scale, sac.tau, sac.actor_lr, sac.critic_lr) == (True, 0.5, 0.005, 3e-4, 3e-4)
+    assert (config.utd, config.batch, config.gamma, config.n_step, config.demo_fraction) == (20.0, 256, 0.99, 1, 0.5)
+    assert (config.warmup_steps, config.total_steps, config.on_success, sac.actor_every) == (5_000, 1_000_000, "continue", 20)
+    lesson = method_config("rlpd", "Door").sac
+    assert (lesson.num_critics, lesson.target_subset, lesson.actor_value, lesson.entropy_backup) == (10, 2, "mean", False)
+
+
+@pytest.mark.parametrize("profile", ["lesson", "paper"])
+def test_the_papers_rlpd_adds_layer_norm_and_demonstrations_to_fine_tuning(profile):
+    """Appendix B.5: and neither ensemble nor a high update-to-data ratio."""
+    ours, plain = (method_config(name, "Door", profile) for name in ("rlpd_paper", "sac_finetune"))
+    assert (ours.sac.critic_layer_norm, ours.demo_fraction, plain.demo_fraction) == (True, 0.5, 0.0)
+    assert (ours.sac.num_critics, ours.sac.target_subset, ours.utd) == (2, 0, plain.utd)
 
 
 @pytest.mark.parametrize("method", ["sac_finetune", "rlpd_paper"])

@@ -470,6 +470,24 @@ def test_jerk_is_judged_as_a_ratio(results, start, recipe, limit, sign):
         assert f"{ratio:.2f} times" in found.measured
 
 
+def test_the_motion_is_judged_on_all_tasks_that_were_decorated(results):
+    """Jerky on tasks of which the comparison has no run: those of the main job count, or the ones over a BeT; where the comparison has
+    runs, they stand for the task."""
+    claim = CLAIMS.claim[CLAIMS.claim.str.startswith("A bounded residual keeps")].item()
+
+    def jerk(times, task="Door", recipe="policy_decorator"):
+        return runs(recipe, [1, 1, 1], task=task, base_jerk=50.0, decorated_jerk=50 * times * np.array([0.98, 1, 1.02]), command="x")
+
+    write(results, "main_job", jerk(3.0, recipe="lesson"), jerk(2.0, "Hammer", "lesson"))
+    assert verdicts.find(claim).verdict == "not" and "Door 3.00, Hammer 2.00" in verdicts.find(claim).measured
+    write(results, "leaderboard", jerk(0.9))
+    found = verdicts.find(claim)
+    assert found.verdict == "partly" and "Door 0.90, Hammer 2.00" in found.measured
+    write(results, "bet_bases", jerk(0.8, "Hammer", "lesson"))
+    found = verdicts.find(claim)
+    assert found.verdict == "reproduced" and "Door 0.90, Hammer 0.80" in found.measured and "bet_bases" in found.command
+
+
 @pytest.mark.parametrize("success, lifted, verdicts_of", [([0.5, 0], [0.9, 0.1], ["reproduced", "reproduced"]),
                                                           ([0.5, 0], [0.1, 0.0], ["partly", "reproduced"]),
                                                           ([1, 1], [0.9, 0.9], ["partly", "not"])])

@@ -29,6 +29,9 @@ _OWN_POLICY = dict(alpha=1.0, alpha_scale=(), H=0, residual_penalty=0.0)
 # many updates a step, bring it near a decorator's run (data/results/leaderboard.csv: updates, train_minutes).
 _TRANSFORMER = dict(batch=64, utd=0.125)
 
+# Under a reward by likeness an end at success would itself be a reward (pdkit/methods/transport.py), on whatever task.
+_LIKENESS = dict(on_success="continue")
+
 # A U-Net with adapters, which also denoises in four steps for every target, so an update is slow: there are fewer, each with half of the
 # original's steps in actions. Not tuned; recorded once (data/results/diffusion_finetuning.csv, notebook 12).
 _DIFFUSION = dict(batch=64, utd=0.03, dipo_steps=10)
@@ -68,7 +71,7 @@ METHODS: dict[str, Method] = {
         # An update of ten critics costs four times one of two, so UTD 20 at full batch would take hours: 1 is ten times too low.
         lesson=dict(utd=1.0),
         paper=dict(utd=20.0, batch=256, gamma=0.99, actor_lr=3e-4, critic_lr=3e-4, tau=0.005, warmup_steps=5_000, total_steps=1_000_000,
-                   actor_every=20),
+                   actor_every=20, on_success="continue"),
         trainer="pdkit.methods.scratch:Scratch"),
     "ppo_decorator": Method(
         "Policy Decorator (PPO)", "appendix D.3; facts.md 4.2: PPO instead of SAC; no numbers given, ours follow cleanrl",
@@ -81,12 +84,12 @@ METHODS: dict[str, Method] = {
         changes=_ON_POLICY | _OWN_POLICY, paper=_ON_POLICY_PAPER, base="bet-sac", trainer="pdkit.methods.ppo:PPOFineTune"),
     "rot": Method(
         "ROT", "Haldar et al. 2022; appendix B.5; facts.md 3.1: SAC fine-tuning, reward by optimal transport, Q-filtered imitation",
-        changes=_OWN_POLICY | dict(warmup="policy", demo_fraction=0.0, reward_shift=0.0), lesson=_TRANSFORMER, base="bet-sac",
+        changes=_OWN_POLICY | dict(warmup="policy", demo_fraction=0.0, reward_shift=0.0), lesson=_TRANSFORMER | _LIKENESS, base="bet-sac",
         trainer="pdkit.methods.rot:ROT"),
     "fish": Method(
         "FISH", "Haldar et al. 2023; appendix B.5, G.2; facts.md 3.6: residual over VINN on a reward by optimal transport",
         changes=dict(alpha=0.2, alpha_scale=(), H=0, critic_input="concat", actor_input="obs+base", warmup="uniform", demo_fraction=0.0,
-                     reward_shift=0.0, residual_penalty=0.0), base="vinn", trainer="pdkit.methods.fish:FISH"),
+                     reward_shift=0.0, residual_penalty=0.0), lesson=_LIKENESS, base="vinn", trainer="pdkit.methods.fish:FISH"),
     "calql": Method(
         "Cal-QL", "Nakamoto et al. 2023; appendix B.5, F.3 (E); facts.md 3.3: imitated transformer, demonstrations, online SAC",
         changes=_CALQL | dict(demo_fraction=0.0), lesson=_TRANSFORMER, paper=_CALQL_PAPER, base="bet-sac",
