@@ -47,6 +47,7 @@ FAMILIES = {  # how the methods are told apart in a figure: by what learns
 STARTS = {"base": "the base policy", "bet-sac": "a BeT for fine-tuning", "vinn": "nearest neighbours (VINN)",
           "diffusion": "a Diffusion Policy"}
 DECORATED = {"StackCube": "bet-sac"}  # by task: the policy that comparisons decorate, where it is not the main job's; a BeT
+FORMS = {"bet-sac": "the paper's", "bet-sac,arm": "arm scaled, too (ours)"}  # of a BeT for SAC, by recipe in bet_forms.csv
 LEAST_RATIO = 0.01  # of smoothness: recorded numbers are rounded, and a policy that stands still has none of it
 
 
@@ -160,18 +161,19 @@ def _text(value: float, low: float = np.nan, high: float = np.nan, scale: float 
 
 
 def forms(table: pd.DataFrame) -> pd.DataFrame:
-    """The paper's Table 10 from rows of data/results/bet_forms.csv, as text, a row a task and a number of gradient steps: how often the
-    original Behavior Transformer succeeds and the one that SAC can fine-tune, and the difference seed by seed, over the seeds of both.
-    Raises PdkitError without any."""
+    """The paper's Table 10 from rows of data/results/bet_forms.csv, as text, a row a task, a number of gradient steps and a modified form:
+    how often the original Behavior Transformer (recipe bet) succeeds and the one that SAC can fine-tune (bet-sac, or with a scale of the
+    kit's own), and the difference seed by seed, over the seeds of both. Raises PdkitError without any."""
     rows = []
-    for (task, steps), part in table.groupby(["task", "iteration"]):
-        pairs = part.pivot(index="seed", columns="policy", values="base_success").reindex(columns=["bet", "bet-sac"]).dropna()
-        both = part[part.seed.isin(pairs.index)].assign(recipe=lambda t: t.policy)
-        original, modified = (_text(pairs[name].mean(), scale=100) for name in pairs)
-        rows += [{"task": task, "demonstrations": both.demos.iloc[0], "gradient steps": f"{steps:,}", "seeds": row.seeds,
-                  "original, %": original, "modified, %": modified,
-                  "modified less original, points": _text(row.value, row.low, row.high, scale=100, form="+.0f")}
-                 for row in differences(both, {"bet-sac": ""}, "bet", "base_success").itertuples()]
+    for (task, steps), part in table.assign(recipe=table.recipe.str.removesuffix(",short")).groupby(["task", "iteration"]):
+        for form in sorted(set(part.recipe) - {"bet"}):
+            pairs = part.pivot(index="seed", columns="recipe", values="base_success").reindex(columns=["bet", form]).dropna()
+            both = part[part.seed.isin(pairs.index)]
+            original, modified = (_text(pairs[name].mean(), scale=100) for name in pairs)
+            rows += [{"task": task, "demonstrations": both.demos.iloc[0], "gradient steps": f"{steps:,}", "seeds": row.seeds,
+                      "original, %": original, "form": FORMS.get(form, form), "modified, %": modified,
+                      "modified less original, points": _text(row.value, row.low, row.high, scale=100, form="+.0f")}
+                     for row in differences(both, {form: ""}, "bet", "base_success").itertuples()]
     if not rows:
         raise PdkitError("No seed of both forms is recorded; `pdkit sweep data/sweeps/bet_forms.toml` makes them.")
     return pd.DataFrame(rows)

@@ -68,12 +68,13 @@ def test_scores_take_the_seeds_that_all_tasks_have():
 
 def test_both_forms_are_compared_on_the_seeds_that_they_share():
     """An interrupted sweep: the original has two seeds more, better ones."""
-    table = pd.concat([runs("x", [0] * 5, policy="bet", base=[0.5, 0.6, 0.4, 0.9, 0.9]),
-                       runs("y", [0] * 3, policy="bet-sac", base=[0.6, 0.7, 0.5])]).assign(demos=5, iteration=1_400)
-    alone = runs("x", [0] * 3, policy="bet").assign(demos=5, iteration=80)  # of another number of steps one form only
-    row, = compare.forms(pd.concat([table, alone])).to_dict("records")
-    assert row == {"task": "Door", "demonstrations": 5, "gradient steps": "1,400", "seeds": 3, "original, %": "50", "modified, %": "60",
-                   "modified less original, points": "+10 (+10 to +10)"}
+    table = pd.concat([runs("bet,short", [0] * 5, base=[0.5, 0.6, 0.4, 0.9, 0.9]), runs("bet-sac,short", [0] * 3, base=[0.6, 0.7, 0.5]),
+                       runs("bet-sac,arm,short", [0] * 3, base=[0.7, 0.8, 0.6])]).assign(demos=5, iteration=1_400)
+    alone = runs("bet", [0] * 3).assign(demos=5, iteration=80)  # of another number of steps one form only
+    ours, paper = compare.forms(pd.concat([table, alone])).to_dict("records")
+    assert paper == {"task": "Door", "demonstrations": 5, "gradient steps": "1,400", "seeds": 3, "original, %": "50",
+                     "form": compare.FORMS["bet-sac"], "modified, %": "60", "modified less original, points": "+10 (+10 to +10)"}
+    assert (ours["form"], ours["modified, %"]) == (compare.FORMS["bet-sac,arm"], "70")
     with pytest.raises(PdkitError, match="bet_forms.toml"):
         compare.forms(alone)
 

@@ -520,6 +520,12 @@ def test_the_modified_bet_must_be_within_10_points_of_the_original(results, off,
     assert verdict_of({"Door": [0.0] * 3, "StackCube": off}) == expected
     assert f"StackCube {100 * np.mean(off):+.1f})" in verdicts.find(claim).measured
     assert verdict_of(dict.fromkeys(verdicts.registry.EIGHT, off)) == everywhere
+    # What the kit scales otherwise is told and not judged, even where nothing else was run.
+    rows = [runs(form, plain, task="Door", base=plain) for form in ("bet", "bet-sac")]
+    write(results, "bet_forms", *rows, *(runs(form, plain, task="StackCube", base=plain + more)
+                                         for form, more in (("bet", 0), ("bet-sac,arm", 0.3))))
+    found = verdicts.find(claim)
+    assert (found.verdict, found.tasks) == ("partly", "Door") and "scaled, too, StackCube +30.0" in found.measured
 
 
 def starting(*starts):
