@@ -71,7 +71,7 @@ def test_both_forms_are_compared_on_the_seeds_that_they_share():
     table = pd.concat([runs("bet,short", [0] * 5, base=[0.5, 0.6, 0.4, 0.9, 0.9]), runs("bet-sac,short", [0] * 3, base=[0.6, 0.7, 0.5]),
                        runs("bet-sac,arm,short", [0] * 3, base=[0.7, 0.8, 0.6])]).assign(demos=5, iteration=1_400)
     alone = runs("bet", [0] * 3).assign(demos=5, iteration=80)  # of another number of steps one form only
-    ours, paper = compare.forms(pd.concat([table, alone])).to_dict("records")
+    paper, ours = compare.forms(pd.concat([table, alone])).to_dict("records")
     assert paper == {"task": "Door", "demonstrations": 5, "gradient steps": "1,400", "seeds": 3, "original, %": "50",
                      "form": compare.FORMS["bet-sac"], "modified, %": "60", "modified less original, points": "+10 (+10 to +10)"}
     assert (ours["form"], ours["modified, %"]) == (compare.FORMS["bet-sac,arm"], "70")

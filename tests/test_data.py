@@ -8,7 +8,7 @@ import pytest
 from pdkit.decorated import load_decorated
 from pdkit.demos import load_demos, sources
 from pdkit.doctor import data_files
-from pdkit.files import DATA, read_json, sha256
+from pdkit.files import DATA, ROOT, read_json, sha256
 from pdkit.policies import load_policy
 from pdkit.profiles import online_config
 from pdkit.tasks import get_task
@@ -23,7 +23,9 @@ def test_every_bundled_file_has_the_recorded_checksum():
 
 
 def test_the_repository_stays_small():
-    assert sum(p.stat().st_size for p in data_files()) < 60e6
+    parts = (ROOT / name for name in ("data", "notebooks", "pdkit", "tests"))
+    files = [p for part in parts for p in part.rglob("*") if p.is_file() and "__pycache__" not in p.parts]
+    assert sum(p.stat().st_size for p in [*files, ROOT / "README.md"]) < 60e6
     weights = Counter(sha256(p) for p in data_files() if p.suffix == ".safetensors")
     assert max(weights.values()) == 1  # a copy names the folder of the first (share_weights)
 
