@@ -34,6 +34,8 @@ from .profiles import flat
 from .recorded import load
 from .runs import Run, origin
 from .stats import Interval, iqm, probability_of_improvement
+from .tasks import get_task
+from .tasks.partnet import object_set
 from .train import decorate
 from .transfer import load_any
 
@@ -247,12 +249,13 @@ def own_run(method: str, task: str, profile: str, seed: int, folder: Path, episo
     needed = config.demo_fraction or trainer_of(method).needs_demos
     demos = sources.bundled(task).first(card["info"]["demos"]) if needed else None
     encoder = encoder_of(start)
-    settings = flat(config) | origin(card, demos, encoder)
+    started_from = origin(card, demos, encoder, object_set(get_task(task)))
+    settings = flat(config) | started_from
     mark = hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:8]
     run = Run(folder / f"{method}-seed{seed}-{mark}", "decorated", settings)
     if not run.finished or run.manifest["results"]["episodes"] != episodes:
         seen = encoded(demos, pictures_of(demos), encoder) if encoder and demos else demos
-        decorate(config, policy, seen, run.folder, episodes, origin(card, demos, encoder), encoder=encoder)
+        decorate(config, policy, seen, run.folder, episodes, started_from, encoder=encoder)
         run = Run(run.folder, "decorated", settings)
     labels = {"task": task, "recipe": recipe or method, "seed": seed, "start": str(start), "folder": str(run.folder)}
     return pd.DataFrame([run.manifest["results"] | labels]), pd.read_csv(run.folder / "metrics.csv").assign(**labels)

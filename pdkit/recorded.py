@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib.pyplot as plt
+import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
@@ -18,6 +19,8 @@ from .files import DATA, atomic_file, read_json, write_json
 from .plots import save_small
 from .runs import describe_machine
 from .stats import wilson
+from .tasks import TASKS
+from .tasks.partnet import object_set
 
 KEYS = ["task", "recipe", "seed"]  # a row with the same ones is replaced
 
@@ -26,9 +29,11 @@ def record(name: str, rows: pd.DataFrame, curves: pd.DataFrame) -> None:
     """Add rows to data/results/NAME.csv and, where there are curves, NAME_curves.csv, and draw NAME.png of trainings anew.
 
     The manifest tells how to make all of it again (the column `sweep` of rows that have one, else `command`) and which machines have
-    recorded here, this one last; a row's `cores` hint at which of them made it.
+    recorded here, this one last; a row's `cores` hint at which of them made it. On the user's own objects (PDKIT_PARTNET) a recipe is
+    called RECIPE,partnet: it stands beside the rows of generated ones.
     """
     folder, tables = DATA / "results", []
+    rows, curves = (_of_their_objects(table) for table in (rows, curves))
     with _alone(name):
         for path, new in ((folder / f"{name}.csv", rows), (folder / f"{name}_curves.csv", curves)):
             if new.empty:
@@ -43,6 +48,11 @@ def record(name: str, rows: pd.DataFrame, curves: pd.DataFrame) -> None:
             return
         with atomic_file(folder / f"{name}.png") as temporary:
             save_small(figure(*tables, "Door" if "Door" in set(tables[0].task) else str(rows.task.iloc[0])), temporary)
+
+
+def _of_their_objects(table: pd.DataFrame) -> pd.DataFrame:
+    own = [task in TASKS and bool(object_set(TASKS[task])) for task in table.task] if len(table) else []
+    return table.assign(recipe=table.recipe.where(~np.array(own), table.recipe + ",partnet")) if any(own) else table
 
 
 def load(name: str, task: str | None = None) -> tuple[pd.DataFrame, pd.DataFrame]:

@@ -47,11 +47,11 @@ def describe_machine() -> dict[str, Any]:
             "cuda": torch.cuda.is_available() and torch.cuda.get_device_name(), "versions": versions, "git": _git()}
 
 
-def origin(base_card: dict[str, Any], demos: Any | None, encoder: Any | None = None) -> dict[str, Any]:
-    """What a run starts from, for its manifest: checksums of the base policy (of its card), of the demonstrations, how many, and of the
-    encoder where there is one."""
+def origin(base_card: dict[str, Any], demos: Any | None, encoder: Any | None = None, objects: str = "") -> dict[str, Any]:
+    """What a run starts from, for its manifest: checksums of the base policy (of its card), of the demonstrations, how many, of the
+    encoder where there is one, and whose objects it meets (tasks.partnet.object_set) where they are not generated."""
     found = {"base": base_card["weights_sha256"], "demos": demos.checksum if demos else None, "num_demos": demos.num if demos else 0}
-    return found | ({"encoder": encoder.checksum} if encoder else {})
+    return found | ({"encoder": encoder.checksum} if encoder else {}) | ({"objects": objects} if objects else {})
 
 
 class Run:

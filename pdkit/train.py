@@ -38,6 +38,7 @@ from .recorded import record
 from .runs import Run, describe_machine, origin
 from .seeds import reported_seeds
 from .tasks import get_task
+from .tasks.partnet import object_set
 from .tasks.spec import TaskSpec
 from .tensorboard import Board
 from .torch_setup import pick_device, set_threads
@@ -160,7 +161,7 @@ def _decorated(args) -> int:
         print(f"{args.task}, seed {seed}: " + str(differences(config, args.profile) or "the profile unchanged"), flush=True)
         out = Path(args.out or runs_root() / "train") / f"{args.task}-{args.recipe}-seed{seed}"
         demos = base_demos(args) if config.demo_fraction or trainer_of(args.method).needs_demos else None
-        started_from = origin(read_card(base_folder), demos, encoder)
+        started_from = origin(read_card(base_folder), demos, encoder, object_set(get_task(args.task)))
         if encoder and demos:
             demos = encoded(demos, pictures_of(demos, Progress(demos.num, "drawn")), encoder)
         row = decorate(config, base, demos, out, args.episodes, started_from, args.tensorboard, encoder)
@@ -241,7 +242,7 @@ def _episodes(actor: Policy | Decorated, spec: TaskSpec, episodes: int) -> pd.Da
 def _base_episodes(base: Policy, spec: TaskSpec, episodes: int, config: OnlineConfig, started_from: dict[str, Any]
                    ) -> pd.DataFrame:
     """The base policy's test episodes: the same for every method and seed that starts from it, so they are run once and kept."""
-    weights = [started_from[name] for name in ("base", "encoder") if name in started_from]
+    weights = [started_from[name] for name in ("base", "encoder", "objects") if name in started_from]
     what = json.dumps([spec.name, config.start_fraction, episodes, *weights, base.kind, base.config, describe_machine()["versions"]])
     kept = runs_root() / "base_episodes" / f"{spec.name}-{hashlib.sha256(what.encode()).hexdigest()[:16]}.csv"
     if not kept.exists():

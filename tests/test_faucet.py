@@ -6,18 +6,24 @@ from types import SimpleNamespace
 from xml.etree import ElementTree
 
 import numpy as np
+import pandas as pd
 import pytest
 from test_maniskill import BEFORE_CONTACT, SAME_BITS, play
 
-from pdkit.demos import save_demos
+from pdkit import recorded, train
+from pdkit.demos import save_demos, sources
 from pdkit.demos.experts import scripted_episodes
 from pdkit.demos.faucet_expert import TurnFaucetExpert
 from pdkit.demos.format import from_episodes
 from pdkit.errors import PdkitError
+from pdkit.files import DATA
+from pdkit.policies import load_policy
+from pdkit.profiles import online_config
+from pdkit.runs import origin
 from pdkit.tasks import faucet_assets, get_task
 from pdkit.tasks.faucet import StockTurnFaucetSource, TurnFaucet, TurnFaucetSource, _corners
 from pdkit.tasks.faucet_assets import PARTNET_NOVEL, PARTNET_SOURCE, faucets, with_metadata
-from pdkit.tasks.partnet import VARIABLE, Model
+from pdkit.tasks.partnet import VARIABLE, Model, object_set
 from pdkit.train import base_demos
 
 SPAN, AXIS, PLACE, LEFT = 32, slice(33, 36), slice(36, 39), 39
@@ -112,6 +118,38 @@ def test_partnet_is_used_where_it_lies(tmp_path, monkeypatch):
         TurnFaucetSource()
     with pytest.raises(PdkitError, match="ManiSkill does not describe faucet 7; reinstall"):
         with_metadata([Model("7", "<robot/>")])
+
+
+def test_results_on_ones_own_objects_are_not_mixed_with_those_on_generated_ones(tmp_path, monkeypatch, results):
+    """Not in a record, not in a run that goes on, not in the kept episodes of the base policy; demonstrations say whose they show."""
+    started = {name: origin({"weights_sha256": "x"}, None, objects=name) for name in ("", "PartNet-Mobility")}
+    assert started[""] != started["PartNet-Mobility"] and "objects" not in started[""]
+    row = pd.DataFrame({"task": ["TurnFaucet", "Door"], "recipe": "lesson", "seed": 0, "success": 0.5, "command": "x"})
+    recorded.record("x", row, pd.DataFrame())
+    partnet(tmp_path, PARTNET_SOURCE)
+    monkeypatch.setenv(VARIABLE, str(tmp_path))
+    assert [object_set(get_task(name)) for name in ("TurnFaucet", "PushChairSource", "Door")] == ["PartNet-Mobility"] * 2 + [""]
+    recorded.record("x", row.assign(success=0.9), pd.DataFrame())
+    table = recorded.load("x")[0].set_index(["task", "recipe"]).success
+    assert table.to_dict() == {("TurnFaucet", "lesson"): 0.5, ("TurnFaucet", "lesson,partnet"): 0.9, ("Door", "lesson"): 0.9}
+    with pytest.warns(UserWarning, match="TurnFaucetSource show generated objects, and the task now has PartNet-Mobility ones"):
+        sources.bundled("TurnFaucet")
+    shown = [{"observations": np.zeros((3, 40)), "actions": np.zeros((2, 7)), "success": np.array([False, True]), "seed": 0}]
+    monkeypatch.setattr(sources, "scripted_episodes", lambda task, *rest: shown)
+    assert sources.scripted("TurnFaucetSource", 1).extra == {"objects": "PartNet-Mobility"}
+    monkeypatch.delenv(VARIABLE)
+    assert sources.scripted("TurnFaucetSource", 1).extra == {} and object_set(get_task("TurnFaucet")) == ""
+
+
+def test_kept_episodes_of_a_base_policy_are_those_of_the_same_objects(monkeypatch, tmp_path):
+    monkeypatch.setenv("PDKIT_RUNS", str(tmp_path))
+    played = []
+    monkeypatch.setattr(train, "_episodes", lambda *given: played.append(1) or pd.DataFrame({"success_once": [len(played)]}))
+    spec, config = get_task("TurnFaucet"), online_config("TurnFaucet")
+    base = load_policy(DATA / "checkpoints" / "TurnFaucet" / "base")
+    for objects, first in (("", 1), ("PartNet-Mobility", 2), ("", 1)):
+        table = train._base_episodes(base, spec, 4, config, origin({"weights_sha256": "x"}, None, objects=objects))
+        assert table.success_once.tolist() == [first]
 
 
 def test_a_folder_that_is_not_there_is_told_in_one_sentence(tmp_path, monkeypatch):

@@ -1,6 +1,7 @@
 """Where demonstrations come from: bundled in data/demos, scripted experts, the project's agents, human ones through Minari."""
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from ..files import DATA
 from ..policies import Policy
 from ..tasks import get_task
 from ..tasks.lanes import IDLE
+from ..tasks.partnet import VARIABLE, object_set
 from ..tasks.spec import TaskSpec
 from ..tasks.vector import VectorEnv
 from .experts import scripted_episodes
@@ -29,7 +31,16 @@ def bundled(task: str) -> Demos:
     if not path.exists():
         have = ", ".join(sorted(p.stem for p in path.parent.glob("*.safetensors"))) or "none"
         raise PdkitError(f"No demonstrations of {shown} are bundled (there are: {have}); make some with `pdkit demos`.")
-    return load_demos(path)
+    return _of_these_objects(load_demos(path))
+
+
+def _of_these_objects(demos: Demos) -> Demos:
+    """The demonstrations; with a warning where they were made with other objects than the task has now (PDKIT_PARTNET)."""
+    shown, now = demos.extra.get("objects", ""), object_set(get_task(demos.task))
+    if shown != now:
+        warnings.warn(f"These demonstrations of {demos.task} show {shown or 'generated'} objects, and the task now has "
+                      f"{now or 'generated'} ones; make others with `pdkit demos {demos.task}`, or change {VARIABLE}.", stacklevel=3)
+    return demos
 
 
 def given(task: str, path: str | Path) -> Demos:
@@ -37,15 +48,16 @@ def given(task: str, path: str | Path) -> Demos:
     demos, wanted = load_demos(path), get_task(task).demo_task or task
     if demos.task != wanted:
         raise PdkitError(f"{path} holds demonstrations of {demos.task}, not of {wanted}.")
-    return demos
+    return _of_these_objects(demos)
 
 
 def scripted(task: str, num: int, first_seed: int = 0, noise: float = 0.0, progress: Callable[[int, int], None] | None = None) -> Demos:
     """`num` successful episodes of the task's scripted expert."""
     command = f"pdkit demos {task} --num {num} --first-seed {first_seed} --noise {noise}"
+    objects = object_set(get_task(task))
     return from_episodes(task, list(scripted_episodes(task, num, first_seed, noise, progress)), label="scripted",
                          how=f"closed-loop scripted expert, action noise {noise}, successful episodes, each ending at its success",
-                         command=command)
+                         command=command, **({"objects": objects} if objects else {}))
 
 
 def _play(policy: Policy, spec: TaskSpec, seeds: Sequence[int], lanes: int, noise: float = 0.0,

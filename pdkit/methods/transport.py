@@ -2,8 +2,8 @@
 
 Success is no reward. But where it ends training episodes (on_success="terminate", the paper profile), it is worth reaching all the
 same, because every further step costs: on the reach probe a constant negative reward then teaches as much as transport does. With
-on_success="continue" (the lesson profile of both, on every task) an episode ends as by a time limit and transport alone teaches. Rows reach the replay when
-their episode is over.
+on_success="continue" (the lesson profile of both, on every task) an episode ends as by a time limit and transport alone teaches. Rows
+reach the replay when their episode is over.
 """
 from __future__ import annotations
 

@@ -81,6 +81,7 @@ class PushChair:
 
 _COMMON = dict(
     suite="maniskill",
+    own_objects=True,
     obs_dim=131,
     act_dim=20,
     max_episode_steps=200,

@@ -157,6 +157,7 @@ def _spec(name: str, make: type[TurnFaucet], which: str, **options: str) -> Task
         summary=f"A Panda arm must push the handle of a faucet round; {which}.",
         joints=9,
         rate=20.0,
+        own_objects=True,
         held_actions=(6,),
         **options,
     )

@@ -15,6 +15,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 from ..errors import PdkitError
+from .spec import TaskSpec
 
 VARIABLE = "PDKIT_PARTNET"
 NAMES = ("mobility_cvx.urdf", "mobility_fixed.urdf", "mobility.urdf")  # ManiSkill 2's corrected files first
@@ -55,6 +56,12 @@ def partnet_models(ids: Sequence[int]) -> list[Model] | None:
         raise PdkitError(f"{VARIABLE} names {folder}, which is not a folder; let it name the folder with the PartNet-Mobility objects, "
                          "or unset it to use generated objects.")
     return [_model(folder, str(one)) for one in ids]
+
+
+def object_set(spec: TaskSpec) -> str:
+    """What results must not be mixed over: "PartNet-Mobility" where a task's objects are the user's own now; "" for generated ones, and
+    for a task without."""
+    return "PartNet-Mobility" if spec.own_objects and os.environ.get(VARIABLE) else ""
 
 
 def _model(folder: Path, name: str) -> Model:

@@ -45,6 +45,7 @@ class TaskSpec:
     rate: float = 1.0  # primitive steps a second
     demo_task: str = ""  # the task whose demonstrations are imitated, where it is another (other objects, same numbers)
     plan_view: bool = False  # pictures are plans of the floor that the task draws itself, without a graphics driver
+    own_objects: bool = False  # its objects are the user's own where PDKIT_PARTNET is set (partnet.py), and generated ones else
     held_actions: tuple[int, ...] = ()  # where actions are not targets: the dimensions that are all the same, such as a gripper's
 
     def resting(self, action: np.ndarray) -> np.ndarray:

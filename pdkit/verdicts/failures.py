@@ -205,7 +205,8 @@ def _() -> Finding:
     own = ""
     with contextlib.suppress(TooLittle):
         scaled = difference(by_seed(table, "bet-sac,arm", "base_success"), by_seed(table, "bet", "base_success"))[1]
-        own = "; with the arm scaled, too, " + ", ".join(f"{task} {signed(mean)}" for task, mean in scaled.groupby(level="task").mean().items())
+        means = scaled.groupby(level="task").mean()
+        own = "; with the arm scaled, too, " + ", ".join(f"{task} {signed(mean)}" for task, mean in means.items())
     return finding("bet_forms", values, f"{told}{task_by_task(values, signed)}{not_judged(near_0)}{early}{own}", points(interval),
                    "reproduced" if inside else "partly" if abs(interval.value) < 0.1 else "not", EIGHT)
 
