@@ -31,6 +31,7 @@ from .rl.replay import Replay
 from .rl.sac import SAC, SACConfig
 from .runs import describe_machine
 from .tasks import get_task
+from .tasks.chair import StockPushChairSource
 from .tasks.faucet import StockTurnFaucetSource
 from .tasks.peg import StockPegInsertionSide
 from .tasks.stack_cube import StockStackCube
@@ -85,7 +86,8 @@ def bench_step(seconds: float) -> dict[str, Any]:
     spec = get_task("StackCube")
     fast, stock = spec.make(), StockStackCube()
     out = {"fast step / stock ManiSkill, one process (steps/s)": _against_stock(fast, stock, 4, seconds)}
-    for other, its_stock in (("PegInsertionSide", StockPegInsertionSide), ("TurnFaucetSource", StockTurnFaucetSource)):
+    for other, its_stock in (("PegInsertionSide", StockPegInsertionSide), ("TurnFaucetSource", StockTurnFaucetSource),
+                             ("PushChairSource", StockPushChairSource)):
         out[f"{other}: fast step / stock ManiSkill, one process, resets included (steps/s)"] = _against_stock(
             get_task(other).make(), its_stock(), get_task(other).act_dim, seconds)
     counts = [0] * 8

@@ -14,7 +14,7 @@ from pdkit.demos.chair_expert import PushChairExpert
 from pdkit.demos.experts import scripted_episodes
 from pdkit.errors import PdkitError
 from pdkit.tasks import chair_assets, get_task
-from pdkit.tasks.chair import PushChair, make_chair_env
+from pdkit.tasks.chair import PushChair, StockPushChairSource, make_chair_env
 from pdkit.tasks.chair_assets import Chair, chairs, generated_chair
 from pdkit.tasks.chair_body import chair_start, solved
 from pdkit.tasks.partnet import UrdfWriter, link_parts
@@ -36,9 +36,9 @@ def fast():
 
 @pytest.fixture(scope="module")
 def stock():
-    env = make_chair_env(chairs("source"))
-    yield env
-    env.close()
+    sim = StockPushChairSource()
+    yield sim
+    sim.close()
 
 
 def play(sim, seed: int, actions) -> tuple[np.ndarray, np.ndarray]:
@@ -141,11 +141,7 @@ def test_chairs_velocities_are_its_motion(fast):
 def test_fast_step_is_the_stock_environments(fast, stock, seed):
     actions = pushing(fast, seed)
     ours, flags = play(fast, seed, actions)
-    theirs, verdicts = [stock.reset(seed=seed)[0][0].numpy()], []
-    for action in actions:
-        observation, _, _, _, info = stock.step(np.clip(action, -1, 1))
-        theirs.append(observation[0].numpy())
-        verdicts.append(bool(info["success"][0]))
+    theirs, verdicts = play(stock, seed, actions)
     np.testing.assert_allclose(ours[:8], theirs[:8], rtol=0, atol=1e-5)
     assert np.abs(np.diff(ours[:, 44:46], axis=0)).max() > 0.01 and any(verdicts)  # the chair was pushed, and home
     if SAME_BITS:
@@ -210,7 +206,8 @@ def test_success_rule_is_the_stock_environments(stock):
     import sapien
 
     stock.reset(seed=0)
-    body, rng, verdicts = stock.chair._objs[0], np.random.default_rng(0), []
+    env = stock._env
+    body, rng, verdicts = env.chair._objs[0], np.random.default_rng(0), []
     for _ in range(150):
         poses = []
         place, tilt = rng.uniform(-0.12, 0.12, 2), rng.normal(0, 4)
@@ -219,7 +216,7 @@ def test_success_rule_is_the_stock_environments(stock):
             turn = sapien.Pose(q=turned("z", 40 + step * rng.uniform(-2.5, 2.5))) * sapien.Pose(q=turned("x", tilt))
             body.set_root_pose(sapien.Pose([*(place + shift), 0.01], turn.q))
             poses.append((body.root_pose.p, body.root_pose.q))
-            info = stock.evaluate()
+            info = env.evaluate()
         verdicts.append(solved(*poses))
         assert verdicts[-1] == bool(info["success"])
     assert 0.2 < np.mean(verdicts) < 0.8

@@ -1,6 +1,7 @@
 """`pdkit train`, `pdkit demos` and the sources of demonstrations."""
 import sys
 
+import minari
 import numpy as np
 import pandas as pd
 import pytest
@@ -67,20 +68,32 @@ def test_a_task_without_bundled_demonstrations_is_said_with_those_that_have_some
         sources.bundled("Pen")
 
 
-def test_no_network_is_said_clearly(monkeypatch):
-    minari = pytest.importorskip("minari")
+@pytest.mark.parametrize("error", [ConnectionError, KeyboardInterrupt])
+def test_no_network_is_said_clearly_and_leaves_no_half_of_a_download(monkeypatch, tmp_path, error):
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
 
-    def offline(*args, **keywords):
-        raise ConnectionError("no route")
+    def offline(name):
+        (tmp_path / name / "data").mkdir(parents=True)
+        raise error("no route")
 
-    monkeypatch.setattr(minari, "load_dataset", offline)
-    with pytest.raises(PdkitError, match="need a network"):
+    monkeypatch.setattr(minari, "download_dataset", offline)
+    with pytest.raises(PdkitError if error is ConnectionError else error, match="need a network|no route"):
+        sources.human("Door")
+    assert not (tmp_path / sources.MINARI["Door"]).exists()
+
+
+def test_damaged_human_demonstrations_are_said_with_what_to_do(monkeypatch, tmp_path):
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    (tmp_path / sources.MINARI["Door"] / "data").mkdir(parents=True)  # what an interrupted download of another program leaves
+    with pytest.raises(PdkitError, match="human-v2 cannot be read .*delete that folder"):
         sources.human("Door")
 
 
-def test_human_demonstrations_are_clipped_and_judged(monkeypatch):
-    """A data set as Minari gives it: raw actions beyond 1, no success recorded, the hinge at index 28."""
-    minari = pytest.importorskip("minari")
+def test_human_demonstrations_are_clipped_and_judged(monkeypatch, tmp_path):
+    """A data set as Minari gives it: raw actions beyond 1, no success recorded, the hinge at index 28. Where only a reward is recorded it
+    decides nothing: Pen's bonus is given within 0.9, the task asks for 0.95."""
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    monkeypatch.setattr(minari, "download_dataset", lambda name: None)
 
     class Recorded:
         observations = np.zeros((5, 39))
@@ -98,6 +111,11 @@ def test_human_demonstrations_are_clipped_and_judged(monkeypatch):
     demos = sources.human("Door")
     assert demos.label == "human" and demos.actions.max() == 1.0
     assert demos.success.tolist() == [False, False, True, True]
+    Recorded.rewards = np.full(4, 20.0)
+    with pytest.raises(PdkitError, match="do not say at which steps they were solved"):
+        sources.human("Pen")
+    Recorded.infos = {"success": np.array([False, False, False, True, True])}  # of the reset, then of each step
+    assert sources._recorded_success("Pen", Recorded).tolist() == [False, False, True, True]
 
 
 def test_agent_episodes_are_what_the_simulator_did(monkeypatch):

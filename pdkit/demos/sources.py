@@ -1,6 +1,7 @@
 """Where demonstrations come from: bundled in data/demos, scripted experts, the project's agents, human ones through Minari."""
 from __future__ import annotations
 
+import shutil
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -138,13 +139,24 @@ def human(task: str) -> Demos:
     if task not in MINARI:
         raise PdkitError(f"There are no human demonstrations of {task}; Minari has: {', '.join(MINARI)}.")
     import minari
+    from minari.storage import get_dataset_path
 
+    folder = Path(get_dataset_path(MINARI[task]))
+    there = folder.exists()
     try:
-        dataset = minari.load_dataset(MINARI[task], download=True)
-        recorded = list(dataset.iterate_episodes())
-    except Exception as error:
+        if not there:
+            minari.download_dataset(MINARI[task])
+    except BaseException as error:  # an interrupted one, too, would leave a part that passes for the whole
+        shutil.rmtree(folder, ignore_errors=True)
+        if not isinstance(error, Exception):
+            raise
         raise PdkitError(f"The human demonstrations of {task} could not be fetched ({type(error).__name__}); they need a network the first "
                          "time: use the bundled ones, or run `pdkit demos " + task + " --source human` where there is one.") from error
+    try:
+        recorded = list(minari.load_dataset(MINARI[task]).iterate_episodes())
+    except Exception as error:  # whatever a damaged file makes of itself
+        raise PdkitError(f"Minari's files of {task} in {folder} cannot be read ({type(error).__name__}); delete that folder, and the same "
+                         "command fetches them anew.") from error
     episodes = [dict(observations=e.observations, actions=np.clip(e.actions, -1, 1), success=_recorded_success(task, e), seed=-1)
                 for e in recorded]
     return from_episodes(task, episodes, label="human", how="human teleoperation (Rajeswaran et al., 2018), through Minari "
@@ -152,11 +164,13 @@ def human(task: str) -> Demos:
 
 
 def _recorded_success(task: str, episode) -> np.ndarray:
-    """Success after each step: the environment's own flag where it was recorded, else the task's rule on the observation."""
+    """Success after each step: the environment's own flag where it was recorded, else (Door) the rule on the observation. Raises PdkitError
+    where neither tells."""
     length = len(episode.actions)
     infos = getattr(episode, "infos", None) or {}
     if "success" in infos:
         return np.asarray(infos["success"], bool).ravel()[-length:]
     if task == "Door":
         return episode.observations[1: length + 1, 28] >= 1.35  # the door's hinge
-    return np.asarray(episode.rewards) >= 10  # the bonus of a solved step in the dense reward
+    # The bonuses in the dense reward are given for less than the task asks for.
+    raise PdkitError(f"Minari's episodes of {task} do not say at which steps they were solved; the version that does is {MINARI[task]}.")

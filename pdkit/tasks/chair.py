@@ -79,6 +79,23 @@ class PushChair:
             env.close()
 
 
+class StockPushChairSource:
+    """PushChairSource through ManiSkill's own step, to test and time the fast step against. A chair is built anew in each episode."""
+
+    def __init__(self):
+        self._env = make_chair_env(chairs("source"))
+
+    def reset(self, seed: int) -> np.ndarray:
+        return self._env.reset(seed=seed)[0][0].numpy()
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, bool]:
+        observation, _, _, _, info = self._env.step(np.clip(action, -1, 1))
+        return observation[0].numpy(), bool(info["success"][0])
+
+    def close(self) -> None:
+        self._env.close()
+
+
 _COMMON = dict(
     suite="maniskill",
     own_objects=True,
