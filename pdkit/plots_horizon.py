@@ -41,10 +41,11 @@ def starts_figure(table: pd.DataFrame, measures: Mapping[str, Progress]) -> Pict
 
 
 @styled
-def exploration_figure(table: pd.DataFrame, title: str = "") -> Picture:
+def exploration_figure(table: pd.DataFrame, title: str = "", *, recorded: pd.DataFrame | None = None) -> Picture:
     """Left: share of episodes with a reward, 95 % Wilson intervals. Right: steps per reward; a triangle at the steps tried where none came.
 
-    `table` has who, start_fraction, episodes, solved, steps and steps_per_reward (see `horizon_analysis.exploration`).
+    `table` has who, start_fraction, episodes, solved, steps and steps_per_reward (see `horizon_analysis.exploration`); `recorded` (who,
+    start_fraction, seed, met) are shares of other runs, a small dot each.
     """
     _columns(table, "who", "start_fraction", "episodes", "solved", "steps", "steps_per_reward")
     figure, axes = blank(1, 2, (9.4, 3.7))
@@ -55,10 +56,15 @@ def exploration_figure(table: pd.DataFrame, title: str = "") -> Picture:
         x = 1 - rows.start_fraction.to_numpy() + 0.008 * (i - 1)  # side by side where they coincide
         bars = [[r.value - r.low for r in rates], [r.high - r.value for r in rates]]
         left.errorbar(x, [r.value for r in rates], bars, fmt="-o", ms=4, lw=1.4, capsize=2, color=color, label=who)
+        if recorded is not None:
+            others = recorded[(recorded.who == who) & recorded.start_fraction.isin(rows.start_fraction)]
+            left.plot(1 - others.start_fraction + 0.008 * (i - 1) + 0.006, others.met, "o", ms=3.5, mew=0, alpha=0.5, color=color)
         met = rows.solved.to_numpy() > 0
         right.plot(x[met], rows.steps_per_reward[met], "-o", ms=4, color=color)
         right.plot(x[~met], rows.steps[~met], "^", ms=8, mfc="white", color=color)
     right.plot([], [], "^", ms=8, mfc="white", color="0.3", label="none within so many steps")
+    if recorded is not None:
+        left.plot([], [], "o", ms=3.5, mew=0, alpha=0.5, color="0.3", label=f"recorded ({recorded.seed.nunique()} runs)")
     right.set(yscale="log", ylabel="environment steps per reward")
     _percent(left, "episodes with a reward")
     for ax in (left, right):
@@ -69,8 +75,11 @@ def exploration_figure(table: pd.DataFrame, title: str = "") -> Picture:
 
 
 @styled
-def propagation_figure(table: pd.DataFrame, title: str = "") -> Picture:
-    """Updates until a corridor is valued right against its length, from rows length, n_step, updates; a line for each n-step return."""
+def propagation_figure(table: pd.DataFrame, title: str = "", *, recorded: pd.DataFrame | None = None) -> Picture:
+    """Updates until a corridor is valued right against its length, from rows length, n_step, updates; a line for each n-step return.
+
+    `recorded` (length, n_step, seed, updates) are means of other runs, a ring each.
+    """
     _columns(table, "length", "n_step", "updates")
     figure, axes = blank(size=(6.4, 3.7))
     ax = axes[0, 0]
@@ -78,8 +87,13 @@ def propagation_figure(table: pd.DataFrame, title: str = "") -> Picture:
         mean = rows.groupby("length").updates.mean()
         ax.plot(mean.index, mean, "-", color=PALETTE[i], label=f"{n_step}-step returns")
         ax.plot(rows.length, rows.updates.astype(float), "o", ms=4, mew=0, alpha=0.7, color=PALETTE[i])
+        if recorded is not None:
+            others = recorded[recorded.n_step == n_step]
+            ax.plot(others.length, others.updates, "o", ms=8, mfc="none", mew=0.9, alpha=0.6, color=PALETTE[i])
+    if recorded is not None:
+        ax.plot([], [], "o", ms=8, mfc="none", mew=0.9, alpha=0.6, color="0.3", label=f"recorded ({recorded.seed.nunique()} runs)")
     ax.set(xlabel="length of the corridor (steps)", ylabel="gradient steps", xlim=(0, None), ylim=(0, None))
-    ax.set_xticks(sorted(set(table.length)))
+    ax.set_xticks(sorted({*table.length, *(() if recorded is None else recorded.length)}))
     ax.yaxis.set_major_formatter(mpl.ticker.FuncFormatter(lambda y, _: f"{y:,.0f}"))
     ax.legend(fontsize=8.5)
     ax.set_title(title)

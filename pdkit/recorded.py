@@ -90,6 +90,18 @@ def by_arm(table: pd.DataFrame, group: str, field: str, name: str) -> pd.DataFra
     return rows.rename_axis(["seed", "recipe"]).rename(name).reset_index()[["recipe", "seed", name]]
 
 
+def by_number(table: pd.DataFrame, group: str, arm: str, number: str, name: str) -> pd.DataFrame:
+    """The same for columns called GROUP.ARM.NUMBER, such as met.random actions.0.25: rows `arm`, `number` (a float), seed, `name`.
+
+    Raises PdkitError when there is no such column.
+    """
+    columns = {column: column.removeprefix(f"{group}.").partition(".")[::2] for column in table if column.startswith(f"{group}.")}
+    if not columns:
+        raise PdkitError(f"These results have no columns {group}.ARM.NUMBER; they come from another notebook.")
+    return pd.DataFrame([{arm: who, number: float(where), "seed": row.seed, name: row[column]}
+                         for _, row in table.iterrows() for column, (who, where) in columns.items()]).dropna()
+
+
 def _machines(path: Path) -> list[dict[str, Any]]:
     """The machines of a manifest and this one, last; of the same machine only the newest commit and threads."""
     this, old = describe_machine(), read_json(path) if path.exists() else {}

@@ -70,9 +70,8 @@ class Trace:
 
 def traces(spec: TaskSpec, policy: Any, seeds: Sequence[int], *, limit: int | None = None, success_tail: int = 0,
            lanes: int = 25) -> list[Trace]:
-    """An episode of `policy` (with act, window and reset) from each seed, in their order, of at most `limit` steps; it ends
-    `success_tail` steps after its first success (0: it does not)."""
-    policy.reset(0)
+    """An episode of `policy` (with act and window) from each seed, in their order, of at most `limit` steps; it ends `success_tail` steps
+    after its first success (0: it does not). What the policy draws goes on from where its `reset` left it."""
     queue, found = [*seeds][::-1], {}
     with VectorEnv(spec, min(lanes, len(queue)), lambda lane: queue.pop() if queue else IDLE, window=policy.window,
                    max_episode_steps=limit, success_tail=success_tail) as envs:

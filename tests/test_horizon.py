@@ -310,6 +310,9 @@ def test_figures_draw_what_they_are_given():
     met = pd.DataFrame({"who": "a", "start_fraction": [0.0, 0.9], "episodes": 10, "solved": [0, 5], "steps": [900, 100],
                         "steps_per_reward": [np.inf, 20.0]})
     right = plots_horizon.exploration_figure(met).axes[1]
+    other = pd.DataFrame({"who": met.who.iloc[0], "start_fraction": [met.start_fraction.iloc[0], 0.123], "seed": [3, 3], "met": 0.37})
+    left = plots_horizon.exploration_figure(met, recorded=other).axes[0]
+    assert [line.get_ydata().tolist() for line in left.lines].count([0.37]) == 1  # where this run has no start, nothing of others either
     assert [list(x.get_ydata()) for x in right.lines[:2]] == [[20.0], [900]]
     starts = pd.DataFrame({"start_fraction": [0.0, 0.5], "hinge": [0, 0.2], "reach": [0.4, 0.1]})
     corridor = pd.DataFrame({"length": [5, 10], "n_step": 1, "updates": [10, None]})

@@ -39,6 +39,15 @@ def test_a_notebooks_columns_become_rows_by_arm():
         recorded.by_arm(table, "drift", "value", "drift")
 
 
+def test_a_notebooks_numbered_columns_become_rows():
+    table = pd.DataFrame({"seed": [0, 1], "met.random actions.0.25": [0.5, None], "met.random actions.0": [0.0, 0.1], "metal.x.1": 9.0})
+    rows = recorded.by_number(table, "met", "who", "start_fraction", "share")
+    assert rows.to_dict("records") == [{"who": "random actions", "start_fraction": where, "seed": seed, "share": share}
+                                       for where, seed, share in ((0.25, 0, 0.5), (0.0, 0, 0.0), (0.0, 1, 0.1))]
+    with pytest.raises(PdkitError, match="no columns x.ARM.NUMBER"):
+        recorded.by_number(table, "x", "who", "start_fraction", "share")
+
+
 def test_the_picture_shows_every_policy_that_methods_start_from():
     """A comparison of methods has several: the first row's alone would stand for all."""
     rows = pd.DataFrame({"task": "Door", "recipe": ["a", "a", "b", "b"], "policy": ["bet", "bet", "vinn", "vinn"], "seed": [0, 1, 0, 1],

@@ -41,6 +41,15 @@ def test_a_policy_that_acts_in_chunks_is_refused():
         analysis.Disturbed(base, DecoratorConfig(alpha=0.3), 0)
 
 
+def test_other_seeds_draw_other_residuals():
+    """All recorded seeds would be one run otherwise."""
+    policy, episodes = analysis.Disturbed(biased_base(), DecoratorConfig(alpha=1.0, H=0), 0), []
+    for seed in (0, 0, 1):
+        policy.reset(seed)
+        episodes.append(analysis.traces(PROBES["reach"], policy, [1, 2], limit=5)[1].observations)
+    assert np.array_equal(*episodes[:2]) and not np.allclose(*episodes[1:], atol=0.05)
+
+
 class Runner:
     """Moves along the corridor probe at a speed."""
 
@@ -48,9 +57,6 @@ class Runner:
 
     def __init__(self, speed):
         self.speed = speed
-
-    def reset(self, seed):
-        self.started = seed
 
     def act(self, windows):
         return np.full((len(windows), 1, 1), self.speed, np.float32)
