@@ -260,6 +260,12 @@ def test_cal_ql_learns(method, offline, steps):
     assert success("reach", policy) > 0.9
 
 
+def test_a_random_transformer_learns(bet_sac):  # noqa: F811
+    """Setup D: it starts from nothing but the policy's normaliser."""
+    _, policy = run("calql_d", bet_sac, lora=0, calql_offline_updates=100, total_steps=4000, utd=0.5)
+    assert success("reach", policy) > 0.9
+
+
 def test_cal_ql_mends_an_imitated_transformer(bet_sac):  # noqa: F811
     """Setup E, the paper's baseline: from a policy that aims beside the goal, with the spread that small actors start with."""
     beside = bet_sac.with_lora(0)

@@ -1,7 +1,13 @@
 """Every method as what it changes in the shared loop (pdkit/online.py): read two of them on one screen.
 
 A method is a set of configuration values over a task's profile, the policy that it starts from, and, where the loop itself
-differs, a subclass of Trainer of a few dozen lines.
+differs, a subclass of Trainer of a few dozen lines, in a module that has its equations. Two have none of their own:
+
+    policy_decorator   a = clip(a_base + alpha * a_res) where a gate that opens over H steps lets it (pdkit/decorator.py); SAC
+                       (pdkit/rl/sac.py)
+    residual_rl        a = clip(a_base + a_res) from the first step: alpha = 1 for each dimension, H = 0 (Johannink et al., 2019; appendix
+                       G.1), uniform residuals until learning begins, and nothing that keeps them small. SAC, all other numbers and, in
+                       the lesson, demonstrations in each batch are the decorator's of the same profile
 """
 from __future__ import annotations
 

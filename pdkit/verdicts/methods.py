@@ -309,7 +309,7 @@ def _() -> Finding:
     bet = by_seed(table[table.task.isin(set(vinn.index.get_level_values("task")))], DECORATOR, "base_success")
     vinn, end, bet = matched(vinn, end, bet)
     interval, values = difference(vinn, bet / 2)
-    told = f"VINN {percent(average(vinn))}, BeT {percent(average(bet))}, FISH on VINN {percent(average(end))}"
+    told = f"VINN (raw observations) {percent(average(vinn))}, BeT {percent(average(bet))}, FISH on VINN {percent(average(end))}"
     return finding("leaderboard", values, told,
                    f"VINN less half of BeT: {points(interval)}", "not" if average(end) >= average(bet) else judged(turned(interval)), EIGHT)
 
