@@ -28,7 +28,7 @@ from .online import Trainer
 from .online_config import OnlineConfig
 from .pixels.cameras import view_of
 from .pixels.encoders import Encoder, save_encoder
-from .pixels.learn import check_pixels, imitate_pixels, visual_settings
+from .pixels.learn import check_pixels, imitate_pixels, look_up, visual_settings
 from .pixels.pictures import encoded, pictures_of
 from .pixels.task import ENCODER, encoder_of, pixel_spec, save_visual
 from .policies import POLICIES, Policy, load_policy, save_policy
@@ -102,14 +102,16 @@ def _base(args) -> int:
     if args.episodes < 0:
         raise PdkitError("--episodes must be 0 (no test) or more.")
     demos, settings = base_demos(args), parse_settings(args.set)
-    shift = settings.pop("random_shift", None) if args.pixels else None
+    shift, eyes = (settings.pop(name, None) if args.pixels else None for name in ("random_shift", "encoder"))
     if args.pixels:
-        check_pixels(args.policy, shift)
+        check_pixels(args.policy, shift, eyes)
     config, architecture = configured(args.policy, settings)
     device = pick_device(args.device) if POLICIES[args.policy].learns else "cpu"
     out = Path(args.out) if args.out else runs_root() / "base" / f"{args.task}-{args.policy}{'-pixels' if args.pixels else ''}"
     print(f"{args.policy} on {demos.num} demonstrations of {args.task} ({demos.label}), on {device}: {config}", flush=True)
-    encoder = None
+    encoder = encoder_of(eyes) if eyes is not None else None
+    if eyes is not None and not encoder:
+        raise PdkitError(f"There is no encoder in {eyes}; name the folder of a policy trained by `pdkit train base {args.task} --pixels`.")
 
     def show(row: dict[str, float]) -> None:
         print("  " + ", ".join(f"{k} {v:.3g}" for k, v in row.items()), flush=True)
@@ -117,9 +119,14 @@ def _base(args) -> int:
     if args.pixels:
         # Wrong settings are refused before anything is drawn.
         POLICIES[args.policy](visual_settings(args.policy, view_of(args.task), get_task(args.task)) | architecture)
+        if encoder:
+            pixel_spec(get_task(args.task), encoder)
         pictures = pictures_of(demos, Progress(demos.num, "drawn"))
-        policy, encoder, history = imitate_pixels(args.policy, demos, pictures, config, architecture, shift=shift, device=device,
-                                                  progress=show)
+        if encoder:
+            policy, history = look_up(demos, pictures, encoder, config, architecture, progress=show)
+        else:
+            policy, encoder, history = imitate_pixels(args.policy, demos, pictures, config, architecture, shift=shift, device=device,
+                                                      progress=show)
     else:
         policy, history = imitate(args.policy, demos, config, architecture, device=device, progress=show)
     best = max(history, key=lambda row: row.get("success_once", row["iteration"]))

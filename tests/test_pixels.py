@@ -21,7 +21,7 @@ from pdkit.pixels import pictures as kept
 from pdkit.pixels import sim as pixel_sim
 from pdkit.pixels.cameras import VIEWS, View, view_of
 from pdkit.pixels.encoders import Encoder, PlainConv, load_encoder, random_shift, save_encoder
-from pdkit.pixels.learn import imitate_pixels, renormalise
+from pdkit.pixels.learn import imitate_pixels, look_up, renormalise
 from pdkit.pixels.pictures import draw, encoded, load_pictures, picture_file, pictures_of, save_pictures
 from pdkit.pixels.sim import PixelSim, panels
 from pdkit.pixels.task import encoder_of, pixel_spec, save_visual
@@ -275,7 +275,7 @@ def test_renormalising_keeps_the_policy(kind, config):
 
 
 def test_only_some_policies_see():
-    with pytest.raises(PdkitError, match="kinds mlp, bet and diffusion, not rnn"):
+    with pytest.raises(PdkitError, match="together with mlp, bet or diffusion, not rnn"):
         imitate_pixels("rnn", reach_demos(1), None, ImitateConfig(), spec=PROBES["reach"], view=REACH)
 
 
@@ -319,6 +319,33 @@ def test_what_only_pictures_show_is_learned(monkeypatch, kind, config, settings)
     policy, encoder, history = imitate_pixels(kind, demos, pictures, training, config, spec=PROBES["lever"], view=view)
     np.testing.assert_allclose(policy.normalizer.mean.numpy(), encoded(demos, pictures, encoder).observations.mean(0), atol=1e-4)
     assert history[-1]["success_once"] == 1.0, history  # blind, half
+
+
+def test_nearest_neighbours_by_the_picture_alone(monkeypatch):
+    """The lever again, through an encoder that nobody trained; the robot's state is a number that says nothing, and large."""
+
+    class Side(Painted):
+        def look(self):
+            picture = np.zeros((3, 64, 64), np.uint8)
+            picture[..., 40:] = 255 * (self.sim.side > 0)
+            return picture, np.empty((0, 64, 64), np.uint16)
+
+    monkeypatch.setitem(pixel_sim.EYES, "probe", Side)
+    side = np.float32([[-1], [1]] * 6)
+    demos = Demos("lever", "scripted", "test", "-", side.repeat(2, axis=0), side, np.ones(12, bool), np.ones(12, np.int64), np.arange(12))
+    view, spec, encoder = View("lever", ("front",), 64, 64, False, ((0, 1),), 0), PROBES["lever"], None
+    torch.manual_seed(0)
+    encoder = Encoder(view).eval().requires_grad_(False)
+    pictures = draw(demos, spec=spec, view=view)
+    policy, (row,) = look_up(demos, pictures, encoder, ImitateConfig(eval_episodes=8), dict(k=1, skip=1), spec=spec)
+    assert row["success_once"] == 1.0 and policy.library.shape == (12, 256)
+    seen = encoded(demos, pictures, encoder).observations
+    changed = seen.copy()
+    changed[:, 0] = 1e3
+    assert np.array_equal(policy.act(seen[:, None]), policy.act(changed[:, None]))  # the state is not looked at
+    assert torch.allclose(policy.library, policy.normalizer(torch.from_numpy(seen[::2]))[:, 1:], atol=1e-6)
+    with pytest.raises(PdkitError, match="leaves out some of raw observations .257 numbers., not 257"):
+        look_up(demos, pictures, encoder, ImitateConfig(eval_episodes=0), dict(skip=257), spec=spec)
 
 
 def test_checkpoints_do_not_change_the_training_of_a_diffusion_policy(painted):
@@ -527,7 +554,12 @@ def test_figures_of_views_and_shifts():
 # ---- what is refused before anything is drawn -----------------------------------------------------------------------
 
 @pytest.mark.parametrize(("words", "message"), [
-    (["base", "Door", "--policy", "cnn", "--pixels"], "kinds mlp, bet and diffusion"),
+    (["base", "Door", "--policy", "cnn", "--pixels"], "kinds mlp, bet, diffusion and vinn"),
+    (["base", "Door", "--policy", "vinn", "--pixels"], "--set encoder=FOLDER"),
+    (["base", "Door", "--policy", "mlp", "--pixels", "--set", "encoder=x"], "trains its own encoder"),
+    (["base", "Door", "--policy", "vinn", "--pixels", "--set", "encoder=data/checkpoints/Door/base"], "no encoder in data"),
+    (["base", "Pen", "--policy", "vinn", "--pixels", "--set", "encoder=data/checkpoints/Door/pixels/base"], "robot of Door, not of Pen"),
+    (["base", "Door", "--policy", "vinn", "--pixels", "--set", "encoder=data/checkpoints/Door/pixels/base", "skip=283"], "leaves out some"),
     (["base", "Door", "--policy", "diffusion", "--pixels", "--set", "own_scale=False"], "Unknown field"),
     (["base", "Door", "--policy", "diffusion", "--pixels", "--set", "horizon=7"], "multiple of"),
     (["base", "Door", "--policy", "mlp", "--pixels", "--set", "random_shift=-1"], "whole number"),

@@ -19,7 +19,7 @@ from ..demos.format import Demos
 from ..errors import PdkitError
 from ..evaluate import selection_scores
 from ..gradient_steps import GradientSteps, make_optimizer
-from ..imitate import Average, ImitateConfig, Windows, best_checkpoint
+from ..imitate import Average, ImitateConfig, Windows, best_checkpoint, imitate
 from ..policies import MLP, POLICIES, BeT, DiffusionPolicy, Policy
 from ..tasks import get_task
 from ..tasks.spec import TaskSpec
@@ -28,7 +28,7 @@ from .encoders import FEATURES, Encoder, random_shift
 from .pictures import Pictures, encoded
 from .task import pixel_spec
 
-HEADS = ("mlp", "bet", "diffusion")
+HEADS = ("mlp", "bet", "diffusion")  # trained together with an encoder
 
 
 def imitate_pixels(kind: str, demos: Demos, pictures: Pictures, config: ImitateConfig, policy_config: dict | None = None, *,
@@ -41,6 +41,8 @@ def imitate_pixels(kind: str, demos: Demos, pictures: Pictures, config: ImitateC
     and one row a checkpoint as `imitate` does. Raises PdkitError for a kind of policy that is not one of HEADS, or a loss that is no
     number.
     """
+    if kind not in HEADS:
+        raise PdkitError(f"An encoder is trained together with {', '.join(HEADS[:-1])} or {HEADS[-1]}, not {kind}.")
     check_pixels(kind, shift)
     view, spec = view or view_of(demos.task), spec or get_task(demos.task)
     shift = view.shift if shift is None else shift
@@ -82,10 +84,24 @@ def imitate_pixels(kind: str, demos: Demos, pictures: Pictures, config: ImitateC
     return *chosen, history
 
 
-def check_pixels(kind: str, shift: Any) -> None:
-    """Raises PdkitError for a kind of policy that is not one of HEADS, or a shift (None: the view's) that is no whole number from 0 on."""
-    if kind not in HEADS:
-        raise PdkitError(f"Policies that see pictures are of the kinds {', '.join(HEADS[:-1])} and {HEADS[-1]}, not {kind}.")
+def look_up(demos: Demos, pictures: Pictures, encoder: Encoder, config: ImitateConfig, policy_config: dict | None = None, *,
+            progress: Callable[[dict], None] | None = None, spec: TaskSpec | None = None) -> tuple[Policy, list[dict]]:
+    """Nearest neighbours (VINN) among demonstrations as an encoder shows them, which another policy was trained with (appendix G.2.1,
+    Table 13): nothing is learned. The policy, and a row as `imitate` gives it; arguments as for `imitate_pixels`."""
+    seen = encoded(demos, pictures, encoder)
+    return imitate("vinn", seen, config, policy_config, progress=progress, spec=pixel_spec(spec or get_task(demos.task), encoder))
+
+
+def check_pixels(kind: str, shift: Any, encoder: Any = None) -> None:
+    """Raises PdkitError for a kind of policy that cannot see, a shift (None: the view's) that is no whole number from 0 on, and for an
+    encoder (a folder) that is given to a policy which trains its own, or not to VINN, which has none."""
+    if kind not in (*HEADS, "vinn"):
+        raise PdkitError(f"Policies that see pictures are of the kinds {', '.join(HEADS)} and vinn, not {kind}.")
+    if (kind == "vinn") != (encoder is not None):
+        raise PdkitError("VINN sees through the encoder of a trained policy: name its folder with --set encoder=FOLDER." if kind == "vinn"
+                         else f"A policy of kind {kind} trains its own encoder; encoder=FOLDER is for vinn.")
+    if kind == "vinn" and shift is not None:
+        raise PdkitError("VINN trains nothing that a random_shift could help; leave it out.")
     if shift is not None and (type(shift) is not int or shift < 0):
         raise PdkitError(f"random_shift counts pixels: it must be a whole number from 0 on, not {shift!r}.")
 

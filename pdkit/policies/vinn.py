@@ -4,9 +4,13 @@
 
 phi is the normalised observation ("raw"); or what the GPT of a trained Behavior Transformer makes of the window, at its last position;
 or the scales and shifts by which the observations steer all blocks of a trained Diffusion Policy's U-Net (FiLM; the paper does not say
-which of them, ours are all: they are the same at each diffusion step up to a constant, which distances do not see). k = 1 copies the
-nearest action, as FISH does. `exclusion` adds FISH's buffer against getting stuck: a neighbour that comes up for more than the
-`tolerance`-th time is passed over for the next nearest, and stays out until `exclusion` others have been put out after it (FISH: 3 and 1).
+which of them, ours are all: they are the same at each diffusion step up to a constant, which distances do not see). `skip` hides the
+first numbers of raw observations from the lookup: beside the features of a picture these are the robot's state, and without them it is
+by the picture alone (Table 13; pdkit/pixels/learn.py makes such observations).
+
+k = 1 copies the nearest action, as FISH does. `exclusion` adds FISH's buffer against getting stuck: a neighbour that comes up for more
+than the `tolerance`-th time is passed over for the next nearest, and stays out until `exclusion` others have been put out after it (FISH:
+3 and 1).
 
 FISH carries that buffer from step to step. A policy here holds no state per episode, so the buffer is played through again from the
 last `history` observations; what was chosen before them is forgotten. How large k is in the paper is not known: 5 is ours.
@@ -31,14 +35,14 @@ LENDERS: dict[str, type[Policy]] = {cls.kind: cls for cls in (BeT, BeTForSAC, Di
 
 
 class VINN(Policy):
-    """Config: obs_dim, act_dim, k, exclusion (0: none), tolerance, history, representation ("raw", or the folder of a trained bet or
-    diffusion, which is replaced by its kind and configuration; its GPT, or FiLM layers, are part of this policy's weights), rows (of the
-    library; 0 before `remember`)."""
+    """Config: obs_dim, act_dim, k, exclusion (0: none), tolerance, history, skip (0: nothing is hidden), representation ("raw", or the
+    folder of a trained bet or diffusion, which is replaced by its kind and configuration; its GPT, or FiLM layers, are part of this
+    policy's weights), rows (of the library; 0 before `remember`)."""
 
     kind = "vinn"
     learns = False
-    defaults: dict[str, Any] = dict(k=5, exclusion=0, tolerance=1, history=20, representation="raw", rows=0)
-    least = dict(exclusion=0, rows=0)
+    defaults: dict[str, Any] = dict(k=5, exclusion=0, tolerance=1, history=20, skip=0, representation="raw", rows=0)
+    least = dict(exclusion=0, skip=0, rows=0)
     made = ("rows",)  # by `remember`
 
     def __init__(self, config: dict[str, Any]):
@@ -47,6 +51,9 @@ class VINN(Policy):
         if c["exclusion"] and c["k"] != 1:
             raise PdkitError(f"VINN's exclusion buffer chooses one neighbour; set k=1 (now {c['k']}) or exclusion=0.")
         trained = self._representation(config.get("representation", "raw"))
+        if c["skip"] and (trained or c["skip"] >= c["obs_dim"]):
+            raise PdkitError(f"VINN's skip leaves out some of raw observations ({c['obs_dim']} numbers), not {c['skip']} of "
+                             f"{'a trained policy' if trained else 'them'}.")
         self.normalizer = Normalizer(c["obs_dim"])
         self.gpt: nn.Module | None = trained.gpt if isinstance(trained, BeT) else None
         self.film: nn.Linear | None = trained.film() if isinstance(trained, DiffusionPolicy) else None
@@ -55,7 +62,7 @@ class VINN(Policy):
             self.normalizer.load_state_dict(seen.state_dict())
         self.looks = trained.window if trained else 1  # observations that make one feature
         self.window = self.looks + (c["history"] if c["exclusion"] else 0)
-        self.feature_dim = self.film.out_features if self.film else trained.config["features"] if trained else c["obs_dim"]
+        self.feature_dim = self.film.out_features if self.film else trained.config["features"] if trained else c["obs_dim"] - c["skip"]
         self.register_buffer("library", torch.zeros(c["rows"], self.feature_dim))
         self.register_buffer("actions", torch.zeros(c["rows"], c["act_dim"]))
         self.requires_grad_(False).eval()
@@ -101,7 +108,7 @@ class VINN(Policy):
         seen = self.normalizer(windows[:, -self.looks:])
         if self.film is not None:
             return self.film(F.mish(seen.flatten(1))).float()
-        return seen[:, -1] if self.gpt is None else self.gpt(seen)[:, -1].float()
+        return seen[:, -1, self.config["skip"]:] if self.gpt is None else self.gpt(seen)[:, -1].float()
 
     def _nearest(self, features: torch.Tensor, k: int) -> tuple[torch.Tensor, torch.Tensor]:
         """Distances and rows (N, k) of the nearest of the library, nearest first."""
