@@ -27,7 +27,7 @@ from .tasks.spec import TaskSpec
 from .tasks.vector import VectorEnv
 
 HANDS = {"Door": slice(29, 32), "StackCube": slice(25, 28)}  # where observations have the position of palm or gripper, in m
-FEATURES = ("raw", "GPT", "FiLM")  # what VINN can look up by here; images (Table 13) are left out: its demonstrations are states
+FEATURES = ("raw", "GPT", "FiLM")  # what VINN looks up by here; pictures (Table 13) are lesson 15's
 
 
 # ---- the first episodes ----------------------------------------------------------------------------------------------
@@ -155,8 +155,9 @@ def lookups(ks: Sequence[int], exclusion: int) -> dict[str, dict[str, Any]]:
     return {f"{features},{name}": {"features": features} | values for features in FEATURES for name, values in settings.items()}
 
 
-def poor_verdict(rates: dict[str, Rate], bet: Rate, features: str = "GPT") -> tuple[str, list[str]]:
-    """"VINN on these features performs extremely poorly" (G.2.1), from success rates by the names of `lookups` and the BeT's.
+def poor_verdict(rates: dict[str, Rate], bet: Rate, features: str = "GPT", whose: str = "BeT") -> tuple[str, list[str]]:
+    """"VINN on these features performs extremely poorly" (G.2.1), from success rates by the names of `lookups` and the BeT's (on pictures
+    another policy's, called `whose`).
 
     Extremely poor means below half of the BeT's success on the same demonstrations and episodes (ours); the *best* k and buffer of the
     features counts, so that no bad choice of ours makes the claim true. reproduced: its Wilson interval lies below that half; partly:
@@ -165,7 +166,7 @@ def poor_verdict(rates: dict[str, Rate], bet: Rate, features: str = "GPT") -> tu
     best, rate = max(((name, r) for name, r in rates.items() if name.startswith(features + ",")), key=lambda item: item[1].value)
     half = bet.value / 2
     verdict = "untested" if not bet.successes else "reproduced" if rate.high < half else "partly" if rate.value < half else "not"
-    return verdict, [f"best of these features, {best}: {rate}; half of the BeT's {100 * bet.value:.0f} % is {100 * half:.0f} %"]
+    return verdict, [f"best of these features, {best}: {rate}; half of the {whose}'s {100 * bet.value:.0f} % is {100 * half:.0f} %"]
 
 
 # ---- the reward of FISH ----------------------------------------------------------------------------------------------

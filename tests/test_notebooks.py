@@ -225,6 +225,7 @@ def test_pixels_where_nothing_can_be_drawn(tmp_path):
     """What is recorded, and who is lost when blindfolded, needs no renderer (tests/test_pixels.py draws)."""
     result = run("15", tmp_path)
     assert result["drawn"] == [] and result["env_steps"] == 0 and result["recorded_runs"] >= 1
+    assert (result["vinn"], result["mlp"], result["table_13"]) == ({}, {}, "untested")
     assert result["times_more_memory"]["Door"] == pytest.approx(43.5, abs=0.1) and set(result["blindfolded"]) == {"base", "decorated"}
     assert result["verdict"] in ("partly", "not") and (tmp_path / "memory.png").exists() and result["exercise_solved"] is False
 

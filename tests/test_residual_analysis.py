@@ -215,6 +215,16 @@ def test_table_12_is_judged_by_its_own_features_and_the_same_yardstick(results):
     assert verdict_of("VINN on features of the Diffusion Policy's FiLM") is None
 
 
+def test_table_13_is_judged_by_the_picture_alone_against_half_of_the_mlp(results):
+    rows = pd.DataFrame({"task": "15_pixels", "recipe": "vinn_pixels", "seed": range(3), "vinn.picture alone,k=1.value": [0.1, 0.0, 0.1],
+                         "vinn.picture and joints,k=5.value": 0.9, "mlp.value": 0.5})
+    rows.to_csv(results / "vinn_pixels.csv", index=False)
+    found = verdict_of("VINN on features of the Diffusion Policy's visual encoder")
+    assert found[:2] == ("partly", "Door") and "picture alone,k=1, the best of 1, 6.7 %; MLP 50.0 %" in found[2]
+    verdict, (reason,) = analysis.poor_verdict({"picture alone,k=1": stats.wilson(1, 40)}, stats.wilson(30, 40), "picture alone", "MLP")
+    assert verdict == "reproduced" and "half of the MLP's 75 % is 38 %" in reason
+
+
 def test_table_11_reproduced_on_all_tasks_only(results, monkeypatch):
     monkeypatch.setattr(verdicts.methods, "EIGHT", ("Door",))
     rows = {"recipe": "vinn", "seed": range(3), "vinn.GPT,k=1.value": [0.1, 0.2, 0.15], "bet.value": 0.9}
