@@ -23,6 +23,7 @@ from .tasks import TASKS
 from .tasks.partnet import object_set
 
 KEYS = ["task", "recipe", "seed"]  # a row with the same ones is replaced
+OWN = ",partnet"  # behind the recipe of a row on the user's own objects
 
 
 def record(name: str, rows: pd.DataFrame, curves: pd.DataFrame) -> None:
@@ -30,10 +31,11 @@ def record(name: str, rows: pd.DataFrame, curves: pd.DataFrame) -> None:
 
     The manifest tells how to make all of it again (the column `sweep` of rows that have one, else `command`) and which machines have
     recorded here, this one last; a row's `cores` hint at which of them made it. On the user's own objects (PDKIT_PARTNET) a recipe is
-    called RECIPE,partnet: it stands beside the rows of generated ones.
+    written as RECIPE,partnet, beside those of generated ones; `load` gives the rows of the objects that are set.
     """
     folder, tables = DATA / "results", []
-    rows, curves = (_of_their_objects(table) for table in (rows, curves))
+    rows, curves = (table.assign(recipe=table.recipe.where(~_on_own_objects(table), table.recipe + OWN)) if len(table) else table
+                    for table in (rows, curves))
     with _alone(name):
         for path, new in ((folder / f"{name}.csv", rows), (folder / f"{name}_curves.csv", curves)):
             if new.empty:
@@ -50,9 +52,18 @@ def record(name: str, rows: pd.DataFrame, curves: pd.DataFrame) -> None:
             save_small(figure(*tables, "Door" if "Door" in set(tables[0].task) else str(rows.task.iloc[0])), temporary)
 
 
-def _of_their_objects(table: pd.DataFrame) -> pd.DataFrame:
-    own = [task in TASKS and bool(object_set(TASKS[task])) for task in table.task] if len(table) else []
-    return table.assign(recipe=table.recipe.where(~np.array(own), table.recipe + ",partnet")) if any(own) else table
+def _on_own_objects(table: pd.DataFrame) -> np.ndarray:
+    """Of each row, whether its task has the user's own objects now."""
+    return np.array([task in TASKS and bool(object_set(TASKS[task])) for task in table.task], bool)
+
+
+def _of_these_objects(table: pd.DataFrame) -> pd.DataFrame:
+    """The rows on the objects that are set now, by the recipes' own names."""
+    if table.empty:
+        return table
+    theirs = table.recipe.astype(str).str.endswith(OWN)
+    named = table.assign(recipe=table.recipe.where(~theirs, table.recipe.astype(str).str.removesuffix(OWN)))
+    return named[theirs == _on_own_objects(table)]
 
 
 def load(name: str, task: str | None = None) -> tuple[pd.DataFrame, pd.DataFrame]:
@@ -61,14 +72,14 @@ def load(name: str, task: str | None = None) -> tuple[pd.DataFrame, pd.DataFrame
     Raises PdkitError when nothing is recorded.
     """
     path, curves = DATA / "results" / f"{name}.csv", DATA / "results" / f"{name}_curves.csv"
-    every = pd.read_csv(path) if path.exists() else pd.DataFrame(columns=KEYS)
+    every = _of_these_objects(pd.read_csv(path)) if path.exists() else pd.DataFrame(columns=KEYS)
     table = every if task is None else every[every.task == task]
     if table.empty:
         known, spec = ", ".join(dict.fromkeys(every.task)), DATA / "sweeps" / f"{name}.toml"
         sweep = f"; `pdkit sweep data/sweeps/{spec.name}` makes them." if spec.exists() else ", and no sweep in data/sweeps makes them."
         others = f", only of {known}." if known else sweep
         raise PdkitError(f"No results {name!r}{f' of {task}' if task else ''} are recorded in data/results{others}")
-    lines = pd.read_csv(curves) if curves.exists() else pd.DataFrame(columns=[*KEYS, "step"])
+    lines = _of_these_objects(pd.read_csv(curves)) if curves.exists() else pd.DataFrame(columns=[*KEYS, "step"])
     return table.reset_index(drop=True), lines[lines.task.isin(table.task)].reset_index(drop=True)
 
 

@@ -52,7 +52,8 @@ from .runs import NO_MATTER
 from .sweep_progress import Progress
 from .sweep_ray import Ray, must_be_installed
 from .sweep_run import LOG, Backend, Job, JobFunction, Local, run_job, run_jobs
-from .tasks import get_task
+from .tasks import TASKS, get_task
+from .tasks.partnet import object_set
 
 KINDS = ("train", "base", "notebook")
 DEFAULTS = {"method": "policy_decorator", "profile": "lesson", "episodes": 200}  # of a training
@@ -236,7 +237,9 @@ def _notebook(spec: Spec, cell: dict[str, Any], seed: int) -> Job:
 
 
 def _job(spec: Spec, parameters: dict[str, Any], labels: dict[str, Any], words: list[str], **others: Any) -> Job:
-    key = hashlib.sha256(json.dumps(parameters, sort_keys=True).encode()).hexdigest()[:10]
+    objects = object_set(TASKS[labels["task"]]) if labels["task"] in TASKS else ""
+    marks = parameters | ({"objects": objects} if objects else {})  # what was run on other objects is another job
+    key = hashlib.sha256(json.dumps(marks, sort_keys=True).encode()).hexdigest()[:10]
     folder = runs_root() / "sweeps" / spec.name / f"{labels['task']}-{labels['recipe']}-seed{labels['seed']}-{key}"
     return Job(spec.kind, labels, tuple(words), folder, parameters, **others)
 

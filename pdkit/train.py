@@ -105,13 +105,13 @@ def _base(args) -> int:
     shift, eyes = (settings.pop(name, None) if args.pixels else None for name in ("random_shift", "encoder"))
     if args.pixels:
         check_pixels(args.policy, shift, eyes)
+    encoder = encoder_of(str(eyes)) if eyes is not None else None
+    if eyes is not None and not encoder:
+        raise PdkitError(f"There is no encoder in {eyes}; name the folder of a policy trained by `pdkit train base {args.task} --pixels`.")
     config, architecture = configured(args.policy, settings)
     device = pick_device(args.device) if POLICIES[args.policy].learns else "cpu"
     out = Path(args.out) if args.out else runs_root() / "base" / f"{args.task}-{args.policy}{'-pixels' if args.pixels else ''}"
     print(f"{args.policy} on {demos.num} demonstrations of {args.task} ({demos.label}), on {device}: {config}", flush=True)
-    encoder = encoder_of(eyes) if eyes is not None else None
-    if eyes is not None and not encoder:
-        raise PdkitError(f"There is no encoder in {eyes}; name the folder of a policy trained by `pdkit train base {args.task} --pixels`.")
 
     def show(row: dict[str, float]) -> None:
         print("  " + ", ".join(f"{k} {v:.3g}" for k, v in row.items()), flush=True)

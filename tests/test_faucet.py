@@ -20,6 +20,7 @@ from pdkit.files import DATA
 from pdkit.policies import load_policy
 from pdkit.profiles import online_config
 from pdkit.runs import origin
+from pdkit.sweep import load_spec, make_jobs
 from pdkit.tasks import faucet_assets, get_task
 from pdkit.tasks.faucet import StockTurnFaucetSource, TurnFaucet, TurnFaucetSource, _corners
 from pdkit.tasks.faucet_assets import PARTNET_NOVEL, PARTNET_SOURCE, faucets, with_metadata
@@ -130,15 +131,25 @@ def test_results_on_ones_own_objects_are_not_mixed_with_those_on_generated_ones(
     monkeypatch.setenv(VARIABLE, str(tmp_path))
     assert [object_set(get_task(name)) for name in ("TurnFaucet", "PushChairSource", "Door")] == ["PartNet-Mobility"] * 2 + [""]
     recorded.record("x", row.assign(success=0.9), pd.DataFrame())
-    table = recorded.load("x")[0].set_index(["task", "recipe"]).success
-    assert table.to_dict() == {("TurnFaucet", "lesson"): 0.5, ("TurnFaucet", "lesson,partnet"): 0.9, ("Door", "lesson"): 0.9}
+    written = pd.read_csv(results / "x.csv").set_index(["task", "recipe"]).success
+    assert written.to_dict() == {("TurnFaucet", "lesson"): 0.5, ("TurnFaucet", "lesson,partnet"): 0.9, ("Door", "lesson"): 0.9}
+    assert recorded.load("x")[0].set_index(["task", "recipe"]).success.to_dict() == dict.fromkeys(
+        [("Door", "lesson"), ("TurnFaucet", "lesson")], 0.9)
     with pytest.warns(UserWarning, match="TurnFaucetSource show generated objects, and the task now has PartNet-Mobility ones"):
         sources.bundled("TurnFaucet")
     shown = [{"observations": np.zeros((3, 40)), "actions": np.zeros((2, 7)), "success": np.array([False, True]), "seed": 0}]
     monkeypatch.setattr(sources, "scripted_episodes", lambda task, *rest: shown)
     assert sources.scripted("TurnFaucetSource", 1).extra == {"objects": "PartNet-Mobility"}
+    spec = tmp_path / "s.toml"
+    spec.write_text('kind = "train"\n[fixed]\ntask = "TurnFaucet"')
+    with pytest.warns(UserWarning):
+        theirs, = make_jobs(load_spec(spec))
     monkeypatch.delenv(VARIABLE)
     assert sources.scripted("TurnFaucetSource", 1).extra == {} and object_set(get_task("TurnFaucet")) == ""
+    assert recorded.load("x")[0].set_index(["task", "recipe"]).success.to_dict() == {
+        ("TurnFaucet", "lesson"): 0.5, ("Door", "lesson"): 0.9}
+    ours, = make_jobs(load_spec(spec))
+    assert (ours.name, ours.words) == (theirs.name, theirs.words) and ours.folder != theirs.folder
 
 
 def test_kept_episodes_of_a_base_policy_are_those_of_the_same_objects(monkeypatch, tmp_path):

@@ -49,6 +49,20 @@ class Painted:
         return picture, np.empty((0, 64, 64), np.uint16)
 
 
+class Side(Painted):
+    """The lever probe's side, as the half of the picture that is bright."""
+
+    def look(self):
+        picture = np.zeros((3, 64, 64), np.uint8)
+        picture[..., 40:] = 255 * (self.sim.side > 0)
+        picture[..., :24] = 255 * (self.sim.side < 0)
+        return picture, np.empty((0, 64, 64), np.uint16)
+
+
+_SIDES = np.float32([[-1], [1]] * 6)
+LEVER = Demos("lever", "scripted", "test", "-", _SIDES.repeat(2, axis=0), _SIDES, np.ones(12, bool), np.ones(12, np.int64), np.arange(12))
+
+
 @pytest.fixture
 def painted(monkeypatch):
     monkeypatch.setitem(pixel_sim.EYES, "probe", Painted)
@@ -302,18 +316,8 @@ def test_what_imitation_leaves(sighted):
     ("mlp", {"hidden": 16}, {}), ("diffusion", SMALL, {"ema_power": 0.75, "iterations": 90, "eval_every": 30})])
 def test_what_only_pictures_show_is_learned(monkeypatch, kind, config, settings):
     """The lever must be pulled to the side on which the picture is bright; the robot's state is empty."""
-
-    class Side(Painted):
-        def look(self):
-            picture = np.zeros((3, 64, 64), np.uint8)
-            picture[..., 40:] = 255 * (self.sim.side > 0)
-            picture[..., :24] = 255 * (self.sim.side < 0)
-            return picture, np.empty((0, 64, 64), np.uint16)
-
     monkeypatch.setitem(pixel_sim.EYES, "probe", Side)
-    side = np.float32([[-1], [1]] * 6)
-    demos = Demos("lever", "scripted", "test", "-", side.repeat(2, axis=0), side, np.ones(12, bool), np.ones(12, np.int64), np.arange(12))
-    view = View("lever", ("front",), 64, 64, False, ((0, 0),), 2)
+    demos, view = LEVER, View("lever", ("front",), 64, 64, False, ((0, 0),), 2)
     pictures = draw(demos, spec=PROBES["lever"], view=view)
     training = ImitateConfig(**{"iterations": 60, "batch": 16, "lr": 3e-3, "eval_every": 60, "eval_episodes": 8, "bf16": False, **settings})
     policy, encoder, history = imitate_pixels(kind, demos, pictures, training, config, spec=PROBES["lever"], view=view)
@@ -322,18 +326,9 @@ def test_what_only_pictures_show_is_learned(monkeypatch, kind, config, settings)
 
 
 def test_nearest_neighbours_by_the_picture_alone(monkeypatch):
-    """The lever again, through an encoder that nobody trained; the robot's state is a number that says nothing, and large."""
-
-    class Side(Painted):
-        def look(self):
-            picture = np.zeros((3, 64, 64), np.uint8)
-            picture[..., 40:] = 255 * (self.sim.side > 0)
-            return picture, np.empty((0, 64, 64), np.uint16)
-
+    """The lever again, through an encoder that nobody trained. The state beside the picture tells the side, too; it is not looked at."""
     monkeypatch.setitem(pixel_sim.EYES, "probe", Side)
-    side = np.float32([[-1], [1]] * 6)
-    demos = Demos("lever", "scripted", "test", "-", side.repeat(2, axis=0), side, np.ones(12, bool), np.ones(12, np.int64), np.arange(12))
-    view, spec, encoder = View("lever", ("front",), 64, 64, False, ((0, 1),), 0), PROBES["lever"], None
+    demos, view, spec = LEVER, View("lever", ("front",), 64, 64, False, ((0, 1),), 0), PROBES["lever"]
     torch.manual_seed(0)
     encoder = Encoder(view).eval().requires_grad_(False)
     pictures = draw(demos, spec=spec, view=view)
@@ -342,7 +337,7 @@ def test_nearest_neighbours_by_the_picture_alone(monkeypatch):
     seen = encoded(demos, pictures, encoder).observations
     changed = seen.copy()
     changed[:, 0] = 1e3
-    assert np.array_equal(policy.act(seen[:, None]), policy.act(changed[:, None]))  # the state is not looked at
+    assert np.array_equal(policy.act(seen[:, None]), policy.act(changed[:, None]))
     assert torch.allclose(policy.library, policy.normalizer(torch.from_numpy(seen[::2]))[:, 1:], atol=1e-6)
     with pytest.raises(PdkitError, match="leaves out some of raw observations .257 numbers., not 257"):
         look_up(demos, pictures, encoder, ImitateConfig(eval_episodes=0), dict(skip=257), spec=spec)

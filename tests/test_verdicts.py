@@ -483,6 +483,8 @@ def test_the_motion_is_judged_on_all_tasks_that_were_decorated(results):
     write(results, "leaderboard", jerk(0.9))
     found = verdicts.find(claim)
     assert found.verdict == "partly" and "Door 0.90, Hammer 2.00" in found.measured
+    write(results, "bet_bases", jerk(0.8, "Hammer", "lesson").iloc[:2])
+    assert "Hammer 2.00" in verdicts.find(claim).measured  # two seeds do not stand for a task
     write(results, "bet_bases", jerk(0.8, "Hammer", "lesson"))
     found = verdicts.find(claim)
     assert found.verdict == "reproduced" and "Door 0.90, Hammer 0.80" in found.measured and "bet_bases" in found.command

@@ -17,6 +17,7 @@ import numpy as np
 from ..errors import PdkitError
 from ..files import atomic_file
 from ..tasks import get_task
+from ..tasks.partnet import object_set
 from ..tasks.spec import TaskSpec
 
 FORMAT = "pdkit-demos-1"
@@ -75,6 +76,8 @@ def from_episodes(task: str, episodes: list[dict[str, Any]], *, label: str, how:
     """Demos from a list of dicts with observations (T+1, obs_dim), actions (T, act_dim), success (T,) and seed."""
     if not episodes:
         raise PdkitError(f"No {task} episode to keep: every attempt failed.")
+    if objects := object_set(spec or get_task(task)):
+        extra = {"objects": objects} | extra
     made = Demos(
         task, label, how, command,
         np.concatenate([e["observations"] for e in episodes]).astype(np.float32),

@@ -55,10 +55,9 @@ def given(task: str, path: str | Path) -> Demos:
 def scripted(task: str, num: int, first_seed: int = 0, noise: float = 0.0, progress: Callable[[int, int], None] | None = None) -> Demos:
     """`num` successful episodes of the task's scripted expert."""
     command = f"pdkit demos {task} --num {num} --first-seed {first_seed} --noise {noise}"
-    objects = object_set(get_task(task))
     return from_episodes(task, list(scripted_episodes(task, num, first_seed, noise, progress)), label="scripted",
                          how=f"closed-loop scripted expert, action noise {noise}, successful episodes, each ending at its success",
-                         command=command, **({"objects": objects} if objects else {}))
+                         command=command)
 
 
 def _play(policy: Policy, spec: TaskSpec, seeds: Sequence[int], lanes: int, noise: float = 0.0,
@@ -142,16 +141,15 @@ def human(task: str) -> Demos:
     from minari.storage import get_dataset_path
 
     folder = Path(get_dataset_path(MINARI[task]))
-    there = folder.exists()
-    try:
-        if not there:
+    if not folder.exists():
+        try:
             minari.download_dataset(MINARI[task])
-    except BaseException as error:  # an interrupted one, too, would leave a part that passes for the whole
-        shutil.rmtree(folder, ignore_errors=True)
-        if not isinstance(error, Exception):
-            raise
-        raise PdkitError(f"The human demonstrations of {task} could not be fetched ({type(error).__name__}); they need a network the first "
-                         "time: use the bundled ones, or run `pdkit demos " + task + " --source human` where there is one.") from error
+        except BaseException as error:  # an interrupted one, too, would leave a part that passes for the whole
+            shutil.rmtree(folder, ignore_errors=True)
+            if not isinstance(error, Exception):
+                raise
+            raise PdkitError(f"The human demonstrations of {task} could not be fetched ({type(error).__name__}); they need a network the "
+                             f"first time: use the bundled ones, or run `pdkit demos {task} --source human` where there is one.") from error
     try:
         recorded = list(minari.load_dataset(MINARI[task]).iterate_episodes())
     except Exception as error:  # whatever a damaged file makes of itself
@@ -173,4 +171,4 @@ def _recorded_success(task: str, episode) -> np.ndarray:
     if task == "Door":
         return episode.observations[1: length + 1, 28] >= 1.35  # the door's hinge
     # The bonuses in the dense reward are given for less than the task asks for.
-    raise PdkitError(f"Minari's episodes of {task} do not say at which steps they were solved; the version that does is {MINARI[task]}.")
+    raise PdkitError(f"Minari's episodes of {task} do not say at which steps they were solved; use the bundled demonstrations.")

@@ -12,8 +12,8 @@ demonstrations, ten critics with LayerNorm and no entropy in their target,
     actor     mean (temperature * log pi(a | s) - mean_i Q_i(s, a)), once a step;  target entropy -act_dim / 2
 
 with batches of 256, rates of 3e-4, tau 0.005, gamma 0.99 and 5,000 random steps first (paper profile). The lesson makes one update a
-step, because ten critics cost four times two. Not as in the original: its offline data hold rollouts of a cloned policy as well, and a
-tenth of each is kept aside; its first temperature, its range of log_std and the lesson's rates and batches are those of the profile.
+step, because ten critics cost four times two, and its rates, batches and first temperature are the profile's. Not as in the original:
+its offline data hold rollouts of a cloned policy as well, and a tenth of each is kept aside.
 """
 from __future__ import annotations
 

@@ -43,7 +43,7 @@ def imitate_pixels(kind: str, demos: Demos, pictures: Pictures, config: ImitateC
     """
     if kind not in HEADS:
         raise PdkitError(f"An encoder is trained together with {', '.join(HEADS[:-1])} or {HEADS[-1]}, not {kind}.")
-    check_pixels(kind, shift)
+    _check_shift(shift)
     view, spec = view or view_of(demos.task), spec or get_task(demos.task)
     shift = view.shift if shift is None else shift
     torch.manual_seed(config.seed)
@@ -102,6 +102,10 @@ def check_pixels(kind: str, shift: Any, encoder: Any = None) -> None:
                          else f"A policy of kind {kind} trains its own encoder; encoder=FOLDER is for vinn.")
     if kind == "vinn" and shift is not None:
         raise PdkitError("VINN trains nothing that a random_shift could help; leave it out.")
+    _check_shift(shift)
+
+
+def _check_shift(shift: Any) -> None:
     if shift is not None and (type(shift) is not int or shift < 0):
         raise PdkitError(f"random_shift counts pixels: it must be a whole number from 0 on, not {shift!r}.")
 

@@ -157,19 +157,18 @@ def _() -> Finding:
 def _() -> Finding:
     """Close: mean jerk at most 1.25 times the base policy's (the quarter is ours). On tasks of the comparison its runs are judged, on the
     others those of the table of all tasks (task_range.over_bets)."""
-    records, found = [], pd.DataFrame()
-    with contextlib.suppress(TooLittle):
-        found = recorded("leaderboard")[0].query(f"recipe == '{DECORATOR}'")
-        records.append("leaderboard")
-    for name in ("bet_bases", "main_job"):
+    parts = []
+    for name, recipe in (("leaderboard", DECORATOR), ("main_job", "lesson"), ("bet_bases", "lesson")):
+        rows = pd.DataFrame(columns=["task", "seed"])
         with contextlib.suppress(TooLittle):
-            more = recorded(name)[0]
-            more = more[more.decorated_jerk.notna() & ~more.task.isin(found.task if len(found) else [])]
-            found = pd.concat([found, more.assign(recipe=DECORATOR)], ignore_index=True)
-            records += [name] * (len(more) > 0)
-    if not records:
-        raise TooLittle("No run of the decorator is recorded.")
-    return _jerk(DECORATOR, 1.25, -1, records, found)
+            rows = recorded(name)[0]
+            rows = rows[(rows.recipe == recipe) & rows.decorated_jerk.notna()]
+        parts.append(rows.assign(recipe=DECORATOR, record=name))
+    compared_on, *jobs = parts
+    compared_on = compared_on[compared_on.groupby("task").seed.transform("nunique") >= LEAST_SEEDS]
+    others = over_bets(*jobs)
+    rows = pd.concat([part for part in (compared_on, others[~others.task.isin(compared_on.task)]) if len(part)] or parts[:1])
+    return _jerk(DECORATOR, 1.25, -1, list(dict.fromkeys(rows.record)), rows)
 
 
 def _jerk(recipe: str, limit: float, sign: int, records: list[str] | str, table: pd.DataFrame) -> Finding:
