@@ -18,7 +18,7 @@ Every verdict follows one of few rules, so that no one is tempted to choose the 
 """
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -287,24 +287,26 @@ def ahead(record: str | Sequence[str], table: pd.DataFrame, own: str, kinds: Map
                    weakest(*(judged_over_tasks(lead[1]) for lead in leads)), paper)
 
 
-def finding(record: str | Sequence[str], values: pd.Series, measured: str, interval: str, verdict: str, paper: Sequence[str] = ()
-            ) -> Finding:
+def finding(record: str | Sequence[str], values: pd.Series, measured: str, interval: str, verdict: str, paper: Sequence[str] = (), *,
+            recipes: Collection[str] = ()) -> Finding:
     """A finding from values by (task, seed), of one record or several; "reproduced" counts as partly where tasks of the claim are
-    missing."""
+    missing. `recipes` are those that were looked at, where not all of the records are: their commands alone are given."""
     tasks = list(dict.fromkeys(values.index.get_level_values("task")))
     if verdict == "reproduced" and not set(paper) <= set(tasks):
         verdict = "partly"
     seeds = " ".join(str(seed) for seed in sorted(set(values.index.get_level_values("seed"))))
     records = [part for name in ([record] if isinstance(record, str) else record) for part, (table, _) in _records(name).items()
                if set(table.task) & set(tasks)]
-    made = [command for part in records for command in commands(part, tasks)]
+    made = [command for part in records for command in commands(part, tasks, recipes)]
     return Finding(" ".join(tasks), seeds, measured, interval, verdict, "; ".join(dict.fromkeys(made)))
 
 
-def commands(record: str, tasks: Sequence[str]) -> list[str]:
-    """What makes the rows of these tasks: the column `sweep` where it is recorded, else a sweep of that name, else the rows' commands."""
+def commands(record: str, tasks: Sequence[str], recipes: Collection[str] = ()) -> list[str]:
+    """What makes the rows of these tasks (and recipes): the column `sweep` where it is recorded, else a sweep of that name, else the rows'
+    commands."""
     table, _ = load(record)
     mine, spec = table[table.task.isin(tasks)], DATA / "sweeps" / f"{record}.toml"
+    mine = mine[mine.recipe.isin(recipes)] if recipes else mine
     known = mine.sweep.dropna() if "sweep" in mine else []
     if len(known) or spec.exists() or "command" not in mine:
         return sorted(set(known)) or [f"pdkit sweep data/sweeps/{spec.name}"]

@@ -333,6 +333,10 @@ def test_a_finding_names_the_sweeps_that_made_its_rows(results):
     other = runs("ppo_decorator", [0.9] * 3, task="Pen").assign(sweep="pdkit sweep other.toml")
     write(results, "leaderboard", table, other)
     assert claims.commands("leaderboard", ["Pen"]) == ["pdkit sweep other.toml"]
+    beside = runs("rlpd", [0.9] * 3).assign(sweep="pdkit sweep slow.toml")  # a recipe that the finding does not look at
+    write(results, "leaderboard", table, other, beside)
+    assert claims.commands("leaderboard", ["Door"], ["ppo_decorator"]) == ["pdkit sweep data/sweeps/leaderboard.toml"]
+    write(results, "leaderboard", table, other)
     assert claims.compared("leaderboard", "ppo_decorator", second_column="base_success").command.count("pdkit sweep") == 2
 
 

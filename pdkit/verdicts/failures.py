@@ -55,7 +55,7 @@ def _() -> Finding:
     at_end, on_the_way = (", ".join(percent(average(side)) for side in sides) for sides in (ends, (one, two)))
     return finding("leaderboard", values, f"Cal-QL and SAC fine-tuning: at the end {at_end}; over all evaluations {on_the_way}"
                    f"{not_judged(near_0)}", f"at the end {points(end)}; over all evaluations {points(way)}",
-                   jointly(judged_over_tasks(-values, -0.1), judged_over_tasks(-over, -0.1)))
+                   jointly(judged_over_tasks(-values, -0.1), judged_over_tasks(-over, -0.1)), recipes=["calql", "sac_finetune"])
 
 
 def _efficiency(first: str, second: str) -> tuple[Interval, pd.Series, str]:

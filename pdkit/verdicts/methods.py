@@ -144,7 +144,7 @@ def _() -> Finding:
     interval, values = difference(end, base)
     told = (f"{rival} {percent(average(end))} (it starts at {percent(average(start))}), BeT base {percent(average(base))}: "
             f"{signed(interval.value)} points")
-    return finding("leaderboard", values, told, points(interval), judged(turned(interval)), TASKS["adroit"])
+    return finding("leaderboard", values, told, points(interval), judged(turned(interval)), TASKS["adroit"], recipes=[rival, DECORATOR])
 
 
 @measures("JSRL gives jerky motion")
@@ -177,7 +177,7 @@ def _jerk(recipe: str, limit: float, sign: int, records: list[str] | str, table:
     interval = mean_interval(ratios)
     told = task_by_task(ratios, lambda ratio: f"{np.exp(ratio):.2f}")
     return finding(records, ratios, f"mean jerk of {recipe} {np.exp(interval.value):.2f} times the base policy's{told}",
-                   times(interval), judged_over_tasks(sign * ratios, sign * float(np.log(limit))))
+                   times(interval), judged_over_tasks(sign * ratios, sign * float(np.log(limit))), recipes=[recipe, "lesson"])
 
 
 @measures("SAC from scratch reaches 0 %")
@@ -197,7 +197,7 @@ def _() -> Finding:
     minutes, plain = matched(*(by_seed(table, recipe, "train_minutes") for recipe in ("rlpd", "sac_from_scratch")))
     interval, ratios = difference(np.log(minutes), np.log(plain))
     return finding("leaderboard", ratios, f"the original RLPD takes {average(minutes):.1f} minutes, SAC from scratch {average(plain):.1f}",
-                   times(interval, 1), judged_over_tasks(ratios, float(np.log(2))))
+                   times(interval, 1), judged_over_tasks(ratios, float(np.log(2))), recipes=["rlpd", "sac_from_scratch"])
 
 
 @measures("Policy Decorator with PPO in place of SAC improves")
@@ -236,7 +236,7 @@ def _() -> Finding:
     every = pd.concat([each for _, each in drops.values()])  # tasks, seeds and commands of all of them
     return finding("leaderboard", every, f"{len(fallen)} of {len(drops)} methods fall; points at the first evaluation against the start: "
                    f"{told}", f"{middle} (the middle one): {points(interval)}",
-                   "reproduced" if len(fallen) > max(1, len(drops) / 2) else "partly" if fallen else "not")
+                   "reproduced" if len(fallen) > max(1, len(drops) / 2) else "partly" if fallen else "not", recipes=list(drops))
 
 
 @measures("Once unlearned, a policy is very hard to relearn")
@@ -258,7 +258,7 @@ def _() -> Finding:
     rate = wilson(len(values) - back, len(values))
     return finding("leaderboard", values, f"{len(values) - back} of {len(values)} unlearned runs end below their start",
                    f"{percent(rate.low)} to {percent(rate.high)} of such runs (Wilson, 95 %)",
-                   "reproduced" if rate.low > 0.5 else "not" if rate.value < 0.5 else "partly")
+                   "reproduced" if rate.low > 0.5 else "not" if rate.value < 0.5 else "partly", recipes=FINE_TUNING)
 
 
 @measures("Residual RL fails early")
@@ -278,7 +278,7 @@ def _() -> Finding:
                    f"{task_by_task(early, percent)}, "
                    f"first reward after {first.median():,.0f} steps (median; {int(first.isna().sum())} of {len(first)} runs never)",
                    points(interval), "reproduced" if early.max() == 0 < start.min() else
-                   weakest("partly", judged_over_tasks(-values, 0.2)))
+                   weakest("partly", judged_over_tasks(-values, 0.2)), recipes=["residual_rl"])
 
 
 @measures("Residual RL fails later")
@@ -293,7 +293,8 @@ def _() -> Finding:
     return finding("leaderboard", ratio, f"mean |residual| {np.exp(size.value):.2f} times mean |base action| in the last quarter"
                    f"{task_by_task(ratio, lambda each: f'{np.exp(each):.2f}')}; success {signed(success.value)} points against the base "
                    f"policy{task_by_task(gains, signed)}",
-                   f"{times(size)}; {points(success)}", jointly(judged_over_tasks(ratio), judged_over_tasks(-gains)))
+                   f"{times(size)}; {points(success)}", jointly(judged_over_tasks(ratio), judged_over_tasks(-gains)),
+                   recipes=["residual_rl"])
 
 
 @measures("FISH fails mainly because")
@@ -310,7 +311,8 @@ def _() -> Finding:
     interval, values = difference(vinn, bet / 2)
     told = f"VINN (raw observations) {percent(average(vinn))}, BeT {percent(average(bet))}, FISH on VINN {percent(average(end))}"
     return finding("leaderboard", values, told,
-                   f"VINN less half of BeT: {points(interval)}", "not" if average(end) >= average(bet) else judged(turned(interval)), EIGHT)
+                   f"VINN less half of BeT: {points(interval)}", "not" if average(end) >= average(bet) else judged(turned(interval)), EIGHT,
+                   recipes=["fish", DECORATOR])
 
 
 def _extremely_poor(features: str, record: str = "vinn", yardstick: str = "bet", whose: str = "BeT") -> Finding:
