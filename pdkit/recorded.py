@@ -59,7 +59,7 @@ def _on_own_objects(table: pd.DataFrame) -> np.ndarray:
 
 def _of_these_objects(table: pd.DataFrame) -> pd.DataFrame:
     """The rows on the objects that are set now, by the recipes' own names."""
-    if table.empty:
+    if table.empty or "recipe" not in table:
         return table
     theirs = table.recipe.astype(str).str.endswith(OWN)
     named = table.assign(recipe=table.recipe.where(~theirs, table.recipe.astype(str).str.removesuffix(OWN)))
