@@ -275,16 +275,18 @@ def set_against(record: str | Sequence[str], one: pd.Series, two: pd.Series, nam
 def ahead(record: str | Sequence[str], table: pd.DataFrame, own: str, kinds: Mapping[str, Sequence[str]], paper: Sequence[str],
           beside: str = "") -> Finding:
     """A finding of the kind "`own` beats the best recipe of every kind": the interval is that of the smallest lead, the verdict that of the
-    weakest. `beside` is told behind what was measured."""
+    weakest. A lead over rivals that were run on some of the tasks says on which. `beside` is told behind what was measured."""
     mine, leads = by_seed(table, own, "decorated_success"), []
     for kind, recipes in kinds.items():
         rival = best(table, recipes)
         interval, values = difference(mine, by_seed(table, rival, "decorated_success"))
         leads.append((interval, values, f"{signed(interval.value)} points against {rival} (best of {kind})"))
-    interval, values, _ = min(leads, key=lambda lead: lead[0].value)
-    told = f"{percent(average(mine.loc[values.index]))}: " + ", ".join(lead[2] for lead in leads) + beside
-    return finding(record, values, told, points(interval),
-                   weakest(*(judged_over_tasks(lead[1]) for lead in leads)), paper)
+    every = pd.concat([values for _, values, _ in leads])
+    several = every.index.get_level_values("task").nunique() > 1
+    told = [text + (task_by_task(values, signed) or (f" ({values.index[0][0]})" if several else "")) for _, values, text in leads]
+    level, least = average(mine.loc[every.index.unique()]), min((interval for interval, _, _ in leads), key=lambda lead: lead.value)
+    return finding(record, every, f"{percent(level)}: {', '.join(told)}{beside}", points(least),
+                   weakest(*(judged_over_tasks(values) for _, values, _ in leads)), paper)
 
 
 def finding(record: str | Sequence[str], values: pd.Series, measured: str, interval: str, verdict: str, paper: Sequence[str] = (), *,

@@ -170,6 +170,12 @@ def test_a_claim_about_more_tasks_is_partly_reproduced_at_most(results):
     assert found.verdict == "partly" and "jsrl" in found.measured and "sac_finetune" in found.measured
     write(results, "leaderboard", *tables, runs("rot", [1, 1, 1]))
     assert verdicts.find(claim).verdict == "not"  # the best of a kind counts
+    # A rival that was run on some tasks says on which; the tasks are those of all leads.
+    write(results, "leaderboard", *tables[:2], *(runs(r, e, task="Pen") for r, e in (("policy_decorator", [0.9] * 3), ("jsrl", [0.8] * 3))),
+          tables[2])
+    found = verdicts.find(claim)
+    assert "jsrl (best of no fine-tuning) (Door +39.0, Pen +10.0)" in found.measured and found.measured.endswith("fine-tuning) (Door)")
+    assert set(found.tasks.split()) == {"Door", "Pen"} and found.measured.startswith("94.5 %")
     everywhere = [table.assign(task=task) for table in tables for task in verdicts.registry.EIGHT]
     write(results, "leaderboard", *everywhere)
     assert verdicts.find(claim).verdict == "reproduced"
