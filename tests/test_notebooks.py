@@ -13,15 +13,17 @@ from pdkit.errors import PdkitError
 from pdkit.files import DATA, ROOT, read_json
 from pdkit.main_job import configured, expected_minutes
 from pdkit.methods.registry import method_config
+from pdkit.tasks import get_task
+from pdkit.video import try_render
 
 NAMES = sorted(nb.notebooks())
 
 
-def run(name, out, cwd=ROOT, **parameters):
-    """Run a notebook as `pdkit nb` does, from the folder `cwd`, without pictures (tests/test_plots_video.py draws)."""
+def run(name, out, cwd=ROOT, render="off", **parameters):
+    """Run a notebook as `pdkit nb` does, from the folder `cwd`, if not told otherwise without pictures (tests/test_plots_video.py draws)."""
     pairs = [word for key, value in parameters.items() for word in ("-p", f"{key}={value}")]
     words = [sys.executable, "-W", "ignore", "-m", "pdkit", "nb", name, "--profile", "smoke", "--out", str(out), *pairs]
-    environment = os.environ | {"PDKIT_RENDER": "off", "PYTHONPATH": str(ROOT)}
+    environment = os.environ | {"PDKIT_RENDER": render, "PYTHONPATH": str(ROOT)}
     done = subprocess.run(words, cwd=cwd, env=environment, capture_output=True, text=True, timeout=280)
     assert done.returncode == 0, done.stderr[-2000:]
     return read_json(out / "result.json")
@@ -228,6 +230,15 @@ def test_pixels_where_nothing_can_be_drawn(tmp_path):
     assert (result["vinn"], result["mlp"], result["table_13"]) == ({}, {}, "untested")
     assert result["times_more_memory"]["Door"] == pytest.approx(43.5, abs=0.1) and set(result["blindfolded"]) == {"base", "decorated"}
     assert result["verdict"] in ("partly", "not") and (tmp_path / "memory.png").exists() and result["exercise_solved"] is False
+
+
+def test_nearest_pictures_beside_the_recorded_ones(tmp_path):
+    if reason := try_render(get_task("Door")):
+        pytest.skip(reason)
+    result = run("15", tmp_path, render="on", total_steps=0, frames=2)
+    assert result["drawn"] == ["Door"] and result["env_steps"] == 0 and set(result["picture_worth"]) >= {"black"}
+    assert set(result["vinn"]) == {"picture alone,k=1", "picture alone,k=5", "picture and joints,k=5"} and result["handle_told"] is not None
+    assert result["table_13"] in ("reproduced", "partly", "not", "untested") and (tmp_path / "lookups.png").exists()
 
 
 def test_leaderboard(tmp_path):
