@@ -308,7 +308,8 @@ def commands(record: str, tasks: Sequence[str], recipes: Collection[str] = ()) -
     commands."""
     table, _ = load(record)
     mine, spec = table[table.task.isin(tasks)], DATA / "sweeps" / f"{record}.toml"
-    mine = mine[mine.recipe.isin(recipes)] if recipes else mine
+    if recipes and (mine := mine[mine.recipe.isin(recipes)]).empty:
+        return []
     known = mine.sweep.dropna() if "sweep" in mine else []
     if len(known) or spec.exists() or "command" not in mine:
         return sorted(set(known)) or [f"pdkit sweep data/sweeps/{spec.name}"]

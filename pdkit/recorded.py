@@ -57,7 +57,7 @@ def _on_own_objects(table: pd.DataFrame) -> np.ndarray:
     return np.array([task in TASKS and bool(object_set(TASKS[task])) for task in table.task], bool)
 
 
-def _of_these_objects(table: pd.DataFrame) -> pd.DataFrame:
+def of_these_objects(table: pd.DataFrame) -> pd.DataFrame:
     """The rows on the objects that are set now, by the recipes' own names."""
     if table.empty or "recipe" not in table:
         return table
@@ -72,14 +72,14 @@ def load(name: str, task: str | None = None) -> tuple[pd.DataFrame, pd.DataFrame
     Raises PdkitError when nothing is recorded.
     """
     path, curves = DATA / "results" / f"{name}.csv", DATA / "results" / f"{name}_curves.csv"
-    every = _of_these_objects(pd.read_csv(path)) if path.exists() else pd.DataFrame(columns=KEYS)
+    every = of_these_objects(pd.read_csv(path)) if path.exists() else pd.DataFrame(columns=KEYS)
     table = every if task is None else every[every.task == task]
     if table.empty:
         known, spec = ", ".join(dict.fromkeys(every.task)), DATA / "sweeps" / f"{name}.toml"
         sweep = f"; `pdkit sweep data/sweeps/{spec.name}` makes them." if spec.exists() else ", and no sweep in data/sweeps makes them."
         others = f", only of {known}." if known else sweep
         raise PdkitError(f"No results {name!r}{f' of {task}' if task else ''} are recorded in data/results{others}")
-    lines = _of_these_objects(pd.read_csv(curves)) if curves.exists() else pd.DataFrame(columns=[*KEYS, "step"])
+    lines = of_these_objects(pd.read_csv(curves)) if curves.exists() else pd.DataFrame(columns=[*KEYS, "step"])
     return table.reset_index(drop=True), lines[lines.task.isin(table.task)].reset_index(drop=True)
 
 

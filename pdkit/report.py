@@ -28,7 +28,7 @@ from .cli import Parser
 from .errors import PdkitError
 from .files import DATA, atomic_file, runs_root
 from .plots import Picture, save_small
-from .recorded import KEYS
+from .recorded import KEYS, of_these_objects
 
 COLUMNS = ["claim", "section", "tasks", "seeds", "measured", "interval", "verdict", "command"]
 VERDICTS = {"reproduced": "what the paper says was found", "partly": "found in part, or not yet with certainty",
@@ -142,7 +142,8 @@ def sections(claims: pd.DataFrame, tables: dict[str, pd.DataFrame], folder: Path
 
 
 def _range(tables: dict[str, pd.DataFrame]) -> Picture:
-    tasks = task_range.by_task(task_range.over_bets(tables["main_job"], tables.get("bet_bases", pd.DataFrame())))
+    jobs, bets = (of_these_objects(tables.get(name, pd.DataFrame())) for name in ("main_job", "bet_bases"))
+    tasks = task_range.by_task(task_range.over_bets(jobs, bets))
     return plots_range.range_figure(tasks, task_range.averages(tasks), "Base policies and decorated ones, best evaluation of a run")
 
 

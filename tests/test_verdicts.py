@@ -342,6 +342,7 @@ def test_a_finding_names_the_sweeps_that_made_its_rows(results):
     beside = runs("rlpd", [0.9] * 3).assign(sweep="pdkit sweep slow.toml")  # a recipe that the finding does not look at
     write(results, "leaderboard", table, other, beside)
     assert claims.commands("leaderboard", ["Door"], ["ppo_decorator"]) == ["pdkit sweep data/sweeps/leaderboard.toml"]
+    assert claims.commands("leaderboard", ["Pen"], ["rlpd"]) == []
     write(results, "leaderboard", table, other)
     assert claims.compared("leaderboard", "ppo_decorator", second_column="base_success").command.count("pdkit sweep") == 2
 

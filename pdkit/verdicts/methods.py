@@ -80,7 +80,7 @@ def _lifted(suites: tuple[str, ...]) -> Finding:
     return finding(records if len(bets) else records[0], values,
                    f"from {percent(average(start))} to {percent(average(end))}{task_by_task(end, percent)}"
                    + not_counted(runs[~judged_here]), f"gain {points(gain)}; level {percent(level.low)} to {percent(level.high)}",
-                   jointly(judged(gain), judged(level, NEARLY)), wanted)
+                   jointly(judged_over_tasks(values), judged(level, NEARLY)), wanted)
 
 
 measures("Policy Decorator lifts BeT bases from 41.5 %")(partial(_lifted, ("maniskill", "adroit")))
@@ -162,7 +162,7 @@ def _() -> Finding:
         rows = pd.DataFrame(columns=["task", "seed"])
         with contextlib.suppress(TooLittle):
             rows = recorded(name)[0]
-            rows = rows[(rows.recipe == recipe) & rows.decorated_jerk.notna()]
+            rows = rows[rows.recipe == recipe].dropna(subset=["decorated_jerk"]) if "decorated_jerk" in rows else rows[:0]
         parts.append(rows.assign(recipe=DECORATOR, record=name))
     compared_on, *jobs = parts
     compared_on = compared_on[compared_on.groupby("task").seed.transform("nunique") >= LEAST_SEEDS]
