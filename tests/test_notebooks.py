@@ -20,7 +20,7 @@ NAMES = sorted(nb.notebooks())
 
 
 def run(name, out, cwd=ROOT, render="off", **parameters):
-    """Run a notebook as `pdkit nb` does, from the folder `cwd`, without pictures unless `render` is on (tests/test_plots_video.py draws)."""
+    """Run a notebook as `pdkit nb` does, from the folder `cwd`, without pictures unless `render` is on."""
     pairs = [word for key, value in parameters.items() for word in ("-p", f"{key}={value}")]
     words = [sys.executable, "-W", "ignore", "-m", "pdkit", "nb", name, "--profile", "smoke", "--out", str(out), *pairs]
     environment = os.environ | {"PDKIT_RENDER": render, "PYTHONPATH": str(ROOT)}
