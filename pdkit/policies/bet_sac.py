@@ -4,9 +4,9 @@
 
 Bins are k-means centres in the space of actions, as before; offsets live before the tanh, where SAC's Gaussian lives. `scale`
 keeps actions at the edge of their range, such as a closed gripper, away from atanh's poles: 0.3 for a ManiSkill gripper, 0.5
-for every Adroit joint. StackCube's shipped policies scale the arm, too, by 0.4: its demonstrated displacements reach that edge, and with the
-gripper's scale alone it solves next to nothing (data/results/bet_forms.csv). The mean is u at the likeliest bin; the spread comes from a head of its own, which imitation leaves alone
-(the paper does not say how it is made).
+for every Adroit joint. StackCube's shipped policies scale the arm, too, by 0.4: its demonstrated displacements reach that edge, and
+with the gripper's scale alone it solves next to nothing (data/results/bet_forms.csv). The mean is u at the likeliest bin; the spread
+comes from a head of its own, which imitation leaves alone (the paper does not say how it is made).
 """
 from __future__ import annotations
 
