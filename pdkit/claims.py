@@ -226,6 +226,12 @@ def not_counted(runs: pd.DataFrame) -> str:
     return f"; not counted: {', '.join(told)}" if told else ""
 
 
+def besides(table: pd.DataFrame, recipes: Sequence[str]) -> str:
+    """What is told behind a finding of methods that are none of the paper's baselines: how their runs end, where there are any."""
+    ends = {recipe: table.decorated_success[table.recipe == recipe] for recipe in recipes}
+    return "".join(f"; beside them {recipe} {percent(runs.mean())} ({len(runs)} runs)" for recipe, runs in ends.items() if len(runs))
+
+
 def signed(value: float) -> str:
     """A difference of shares in points, without the word."""
     return f"{100 * value:+.1f}"

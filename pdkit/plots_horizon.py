@@ -53,12 +53,13 @@ def exploration_figure(table: pd.DataFrame, title: str = "", *, recorded: pd.Dat
     for i, (who, rows) in enumerate(table.groupby("who", sort=False)):
         rows, color = rows.sort_values("start_fraction"), PALETTE[i]
         rates = [wilson(int(r.solved), int(r.episodes)) for r in rows.itertuples()]
-        x = 1 - rows.start_fraction.to_numpy() + 0.008 * (i - 1)  # side by side where they coincide
+        shift = 0.008 * (i - 1)  # side by side where they coincide
+        x = 1 - rows.start_fraction.to_numpy() + shift
         bars = [[r.value - r.low for r in rates], [r.high - r.value for r in rates]]
         left.errorbar(x, [r.value for r in rates], bars, fmt="-o", ms=4, lw=1.4, capsize=2, color=color, label=who)
         if recorded is not None:
             others = recorded[(recorded.who == who) & recorded.start_fraction.isin(rows.start_fraction)]
-            left.plot(1 - others.start_fraction + 0.008 * (i - 1) + 0.006, others.met, "o", ms=3.5, mew=0, alpha=0.5, color=color)
+            left.plot(1 - others.start_fraction + shift + 0.006, others.met, "o", ms=3.5, mew=0, alpha=0.5, color=color)
         met = rows.solved.to_numpy() > 0
         right.plot(x[met], rows.steps_per_reward[met], "-o", ms=4, color=color)
         right.plot(x[~met], rows.steps[~met], "^", ms=8, mfc="white", color=color)

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib.pyplot as plt
-import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
@@ -52,9 +51,9 @@ def record(name: str, rows: pd.DataFrame, curves: pd.DataFrame) -> None:
             save_small(figure(*tables, "Door" if "Door" in set(tables[0].task) else str(rows.task.iloc[0])), temporary)
 
 
-def _on_own_objects(table: pd.DataFrame) -> np.ndarray:
+def _on_own_objects(table: pd.DataFrame) -> pd.Series:
     """Of each row, whether its task has the user's own objects now."""
-    return np.array([task in TASKS and bool(object_set(TASKS[task])) for task in table.task], bool)
+    return table.task.isin([name for name, spec in TASKS.items() if object_set(spec)])
 
 
 def of_these_objects(table: pd.DataFrame) -> pd.DataFrame:

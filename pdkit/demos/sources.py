@@ -32,10 +32,10 @@ def bundled(task: str) -> Demos:
     if not path.exists():
         have = ", ".join(sorted(p.stem for p in path.parent.glob("*.safetensors"))) or "none"
         raise PdkitError(f"No demonstrations of {shown} are bundled (there are: {have}); make some with `pdkit demos`.")
-    return _of_these_objects(load_demos(path))
+    return _warned_of_objects(load_demos(path))
 
 
-def _of_these_objects(demos: Demos) -> Demos:
+def _warned_of_objects(demos: Demos) -> Demos:
     """The demonstrations; with a warning where they were made with other objects than the task has now (PDKIT_PARTNET)."""
     shown, now = demos.extra.get("objects", ""), object_set(get_task(demos.task))
     if shown != now:
@@ -49,7 +49,7 @@ def given(task: str, path: str | Path) -> Demos:
     demos, wanted = load_demos(path), get_task(task).demo_task or task
     if demos.task != wanted:
         raise PdkitError(f"{path} holds demonstrations of {demos.task}, not of {wanted}.")
-    return _of_these_objects(demos)
+    return _warned_of_objects(demos)
 
 
 def scripted(task: str, num: int, first_seed: int = 0, noise: float = 0.0, progress: Callable[[int, int], None] | None = None) -> Demos:

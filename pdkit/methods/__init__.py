@@ -39,7 +39,7 @@ _TRANSFORMER = dict(batch=64, utd=0.125)
 _LIKENESS = dict(on_success="continue")
 
 # A U-Net with adapters, which also denoises in four steps for every target, so an update is slow: there are fewer, each with half of the
-# original's steps in actions. Not tuned; recorded once (data/results/diffusion_finetuning.csv, notebook 12).
+# original's steps in actions. Not tuned; recorded in data/results/diffusion_finetuning.csv (notebook 12).
 _DIFFUSION = dict(batch=64, utd=0.03, dipo_steps=10)
 
 # PPO learns from its own policy alone, with the learning rate falling from the start (as in cleanrl) and a spread that starts at 0.6

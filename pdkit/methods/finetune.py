@@ -3,10 +3,9 @@
     a = a_pi(o),  pi the whole Behavior Transformer, by SAC's actor loss through its adapters
 
 No base action is added and nothing is gated: alpha = 1, H = 0 over a policy that does nothing. Critics are small MLPs that see the
-last observation; the actor sees the whole window, so whole windows are stored. Numbers: adapters of rank 8 on attention and regression
-head (the paper gives none), batches of 64 and an update every eight steps in the lesson profile, SAC's own of the paper's code in the
-paper profile. With another `critic_backbone` critics, too, see the
-window, through a transformer (pdkit/rl/gpt_critic.py; appendix F.5.1).
+last observation; the actor sees the whole window, so whole windows are stored. With another `critic_backbone` critics, too, see the
+window, through a transformer (pdkit/rl/gpt_critic.py; appendix F.5.1). Numbers: adapters of rank 8 on attention and regression head (the
+paper gives none), batches of 64 and an update every eight steps in the lesson profile, those of the paper's code in the paper profile.
 """
 from __future__ import annotations
 

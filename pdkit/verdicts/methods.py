@@ -20,6 +20,7 @@ from ..claims import (
     TooLittle,
     ahead,
     average,
+    besides,
     best,
     by_seed,
     compared,
@@ -48,6 +49,8 @@ from ..stats import wilson
 from ..task_range import over_bets
 from .registry import EIGHT, measures
 
+BESIDES = ("ppo_finetune", "rlpd")  # methods that the paper does not count among its baselines
+
 # ---- the comparison of methods (leaderboard) --------------------------------------------------------------------------
 
 def _on_bet(kind: str = "") -> pd.DataFrame:
@@ -56,12 +59,6 @@ def _on_bet(kind: str = "") -> pd.DataFrame:
     own = table[table.recipe == DECORATOR]
     bets = set(own.task) - set(own.task[~own.policy.isin(BETS)])
     return table[table.task.isin(bets & set(TASKS[kind] if kind else EIGHT))]
-
-
-def _besides(table: pd.DataFrame) -> str:
-    """Final success of methods that the paper does not count among its baselines."""
-    known = {name: table.decorated_success[table.recipe == name] for name in ("ppo_finetune", "rlpd")}
-    return "".join(f"; beside them {name} {percent(ends.mean())} ({len(ends)} runs)" for name, ends in known.items() if len(ends))
 
 
 def _lifted(suites: tuple[str, ...]) -> Finding:
@@ -109,7 +106,7 @@ def _() -> Finding:
 def _() -> Finding:
     """Ahead of the best of both kinds; the interval is that of the smaller lead. Others than the paper's baselines are told beside it."""
     table = _on_bet()
-    return ahead("leaderboard", table, DECORATOR, {"no fine-tuning": OTHERS, "fine-tuning": FINE_TUNING}, EIGHT, _besides(table))
+    return ahead("leaderboard", table, DECORATOR, {"no fine-tuning": OTHERS, "fine-tuning": FINE_TUNING}, EIGHT, besides(table, BESIDES))
 
 
 @measures("The best baseline that fine-tunes BeT (36.7 %)")
@@ -120,7 +117,7 @@ def _() -> Finding:
     end, start = (by_seed(table, rival, column) for column in ("decorated_success", "base_success"))
     interval, values = difference(end, start)
     return finding("leaderboard", values, f"{rival} {percent(average(end))}, its start {percent(average(start))}: "
-                   f"{signed(interval.value)} points{_besides(table)}", points(interval), judged(turned(interval)), TASKS["adroit"])
+                   f"{signed(interval.value)} points{besides(table, BESIDES)}", points(interval), judged(turned(interval)), TASKS["adroit"])
 
 
 @measures("The best baseline that fine-tunes BeT reaches 0 %")
