@@ -18,6 +18,7 @@ from pdkit.files import DATA
 from pdkit.imitate import ImitateConfig
 from pdkit.online import Trainer
 from pdkit.pixels import pictures as kept
+from pdkit.pixels import sapien_eyes
 from pdkit.pixels import sim as pixel_sim
 from pdkit.pixels.cameras import VIEWS, View, view_of
 from pdkit.pixels.encoders import Encoder, PlainConv, load_encoder, random_shift, save_encoder
@@ -114,6 +115,47 @@ def test_drawing_changes_nothing_and_simulations_share_a_context():
     assert alone[0].rgb[:, :16].mean() < 20 < 80 < alone[0].rgb[:, -16:].mean()  # the dark is above, the table below
     assert panels(alone[0].rgb).shape == (128, 128, 3)
     np.testing.assert_array_equal(panels(alone[0].rgb)[..., 2], alone[0].rgb[2])
+
+
+def test_a_coarser_mesh_keeps_its_shape():
+    """A sphere of half a metre: fewer vertices, on the sphere, looking outwards; nothing shrunk to a line, no triangle twice."""
+    import trimesh
+
+    sphere = trimesh.creation.icosphere(subdivisions=5, radius=0.5)
+    vertices, triangles, normals = sapien_eyes.coarser(sphere.vertices, sphere.faces, sphere.vertices, 0.05)
+    assert len(triangles) < len(sphere.faces) / 5 and triangles.max() == len(vertices) - 1
+    assert (vertices.dtype, triangles.dtype, normals.dtype) == (np.float32, np.uint32, np.float32)
+    np.testing.assert_allclose(np.linalg.norm(vertices, axis=1), 0.5, atol=0.01)
+    np.testing.assert_allclose(normals, vertices / np.linalg.norm(vertices, axis=1, keepdims=True), atol=0.01)
+    assert all(len(set(corners)) == 3 for corners in triangles.tolist()) and len(np.unique(triangles, axis=0)) == len(triangles)
+    assert trimesh.Trimesh(vertices, triangles).volume == pytest.approx(sphere.volume, rel=0.05)  # wound as before: inside is inside
+    whole = sapien_eyes.coarser(sphere.vertices, sphere.faces, sphere.vertices, 1e-6)
+    assert len(whole[0]) == len(sphere.vertices) and len(whole[1]) == len(sphere.faces)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("task", ["StackCube", "PegInsertionSide"])
+def test_the_realsense_is_drawn_with_few_triangles(task, monkeypatch):
+    """All cameras see next to what ManiSkill's own mesh shows, with a fiftieth of its triangles."""
+    drawable("StackCube")
+    spec, frames, triangles = get_task(task), [], []
+    actions = np.random.default_rng(0).uniform(-1, 1, (6, spec.act_dim)).astype(np.float32)
+    for _ in range(2):
+        sim = PixelSim(spec)
+        try:
+            frames.append([sim.reset(3)] + [sim.step(action)[0] for action in actions])
+            link = sim._sim._env.agent.robot.links_map[sapien_eyes.REALSENSE]._objs[0].entity
+            (body,) = [c for c in link.components if type(c).__name__ == "RenderBodyComponent"]
+            triangles.append(sum(len(part.triangles) for shape in body.render_shapes for part in shape.parts))
+        finally:
+            sim.close()
+        monkeypatch.setattr(sapien_eyes, "_coarsen_realsense", lambda env: None)
+    coarse, fine = ([np.stack([getattr(f, what) for f in run]).astype(int) for what in ("rgb", "depth")] for run in frames)
+    assert triangles[1] > 400_000 and triangles[0] < triangles[1] / 40
+    base, hand = slice(0, 3), slice(3, 6)
+    assert (np.abs(coarse[0][:, base] - fine[0][:, base]) > 8).mean() < 0.002
+    np.testing.assert_array_equal(coarse[0][:, hand], fine[0][:, hand])
+    assert (np.abs(coarse[1] - fine[1]) > 10).mean() < 0.001  # a centimetre
 
 
 @pytest.mark.slow
