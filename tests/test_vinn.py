@@ -69,6 +69,18 @@ def test_a_large_library_is_looked_up_as_exactly_as_by_measuring_all_of_it():
     assert (distance[: len(library[::7]), 0] == 0).all()
 
 
+def test_another_library_is_looked_up_at_once():
+    """What is kept of a library between two looks belongs to that library: remembered anew, or loaded over it."""
+    policy, moved = lookup(k=1), lookup(k=1)
+    moved.library += 10
+    asked = (0.1, 10.9)
+    assert act(policy, *asked).tolist() == [0.0, -1.0] and act(moved, *asked).tolist() == [0.0, 0.5]
+    policy.load_state_dict(moved.state_dict())
+    assert act(policy, *asked).tolist() == [0.0, 0.5]
+    policy.remember(torch.tensor([0.0, 11.0])[:, None, None], torch.tensor([[0.25], [0.75]]))
+    assert act(policy, *asked).tolist() == [0.25, 0.75]
+
+
 def test_distances_are_in_normalised_units():
     policy = VINN({"obs_dim": 2, "act_dim": 1, "k": 1})
     observations = np.array([[0, 0], [1, 300], [0, 100]], np.float32)

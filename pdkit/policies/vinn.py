@@ -65,6 +65,7 @@ class VINN(Policy):
         self.feature_dim = self.film.out_features if self.film else trained.config["features"] if trained else c["obs_dim"] - c["skip"]
         self.register_buffer("library", torch.zeros(c["rows"], self.feature_dim))
         self.register_buffer("actions", torch.zeros(c["rows"], c["act_dim"]))
+        self._kept: tuple[Any, torch.Tensor, torch.Tensor] | None = None  # of _in_double
         self.requires_grad_(False).eval()
 
     def _representation(self, given: Any) -> Policy | None:
@@ -100,7 +101,7 @@ class VINN(Policy):
         if len(windows) < max(self.config["k"], self.config["exclusion"] + 1):
             raise PdkitError(f"VINN needs at least as many demonstrated steps as neighbours, not {len(windows)}; use more demonstrations.")
         self.library = torch.cat([self.features(part) for part in windows.to(self.library.device).split(1024)])
-        self.actions = actions.to(self.library.device).clone()
+        self.actions, self._kept = actions.to(self.library.device).clone(), None
         self.config["rows"] = len(windows)
 
     def features(self, windows: torch.Tensor) -> torch.Tensor:
@@ -110,14 +111,24 @@ class VINN(Policy):
             return self.film(F.mish(seen.flatten(1))).float()
         return seen[:, -1, self.config["skip"]:] if self.gpt is None else self.gpt(seen)[:, -1].float()
 
+    def _in_double(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """The library in double precision, and half of its rows' squares: made at the first look and kept, as the library lies still."""
+        state = (self.library.data_ptr(), self.library._version, self.library.device)
+        if self._kept is None or self._kept[0] != state:
+            rows = self.library.double()
+            self._kept = state, rows, rows.square().sum(dim=1) / 2
+        return self._kept[1:]
+
     def _nearest(self, features: torch.Tensor, k: int) -> tuple[torch.Tensor, torch.Tensor]:
         """Distances and rows (N, k) of the nearest of the library, nearest first."""
         if not len(self.library):
             raise PdkitError("This VINN has no demonstrations to look up; make one with `pdkit train base TASK --policy vinn`.")
         # Matrix products find the likely ones many times faster in a large library. Which of these are nearest is decided without:
         # the rounding of a product would not be 0 at a demonstrated observation.
-        products = torch.cdist(features.double(), self.library.double(), compute_mode="use_mm_for_euclid_dist")
-        likely = products.topk(min(k + SPARE, len(self.library)), dim=1, largest=False).indices
+        rows, squares = self._in_double()
+        # |phi - phi_i|^2 / 2, but for |phi|^2 / 2, which is the same for all rows
+        halves = torch.addmm(squares, features.double(), rows.T, alpha=-1)
+        likely = halves.topk(min(k + SPARE, len(self.library)), dim=1, largest=False).indices
         exact = torch.cdist(features[:, None], self.library[likely], compute_mode="donot_use_mm_for_euclid_dist")[:, 0]
         distance, order = exact.topk(k, dim=1, largest=False)
         return distance, likely.gather(1, order)
