@@ -187,6 +187,12 @@ def test_task_horizon(tmp_path):
     assert result["own"]["recipe"] == "sac_finetune,start_fraction=0.5" and result["own"]["steps"] >= 600
 
 
+def test_task_horizon_without_a_run_of_ones_own(tmp_path):
+    """As the sweeps of random exploration play it: the recorded runs are drawn all the same."""
+    result = run("10", tmp_path, own_steps=0, episodes=2, n_steps="[5]", fractions="[0.0, 0.9]")
+    assert result["own"] is None and result["recorded_runs"] > 0 and (tmp_path / "success.png").exists()
+
+
 def test_task_horizon_of_the_cube(tmp_path):
     result = run("10", tmp_path, task="StackCube", episodes=2, n_steps="[5]", own_method="policy_decorator", own_start=0.75)
     assert result["own"]["recipe"] == "policy_decorator,start_fraction=0.75"
