@@ -15,6 +15,8 @@ SPEC is a TOML (or JSON) file:
     critic_input = "concat"
     recipe = "critic-concat"  # optional: what a cell is called; by default the values in which it differs
     seeds = [0]               # optional: its own seeds
+    [bases."runs/base/own"]   # optional: base policies that are not shipped, by the folder that cells name as `base`, with what
+    policy = "diffusion"      #   `kind = "base"` takes; a sweep that needs one that is not there makes it first
 
 All cells run with the first seed, then all with the next: a sweep that is stopped early compares them on fewer seeds.
 
@@ -24,6 +26,7 @@ it takes by --set; a notebook's are `notebook` and its parameters. Paths are rel
 """
 from __future__ import annotations
 
+import argparse
 import contextlib
 import fcntl
 import hashlib
@@ -33,7 +36,7 @@ import re
 import shlex
 import tomllib
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -45,7 +48,7 @@ from .files import ROOT, read_json, runs_root
 from .imitate import configured, untrained
 from .main_job import duration, expected_minutes
 from .methods.registry import base_folder, method_config
-from .policies import POLICIES, load_policy
+from .policies import POLICIES, Policy, load_policy
 from .policies.base import read_card
 from .profiles import flat
 from .runs import NO_MATTER
@@ -63,6 +66,8 @@ BASE_OPTIONS = ("task", "policy", "num_demos", "demos", "episodes")
 NUMBERS = ("episodes", "num_demos")  # of all these; the others are words
 NAME = re.compile(r"[\w.-]+")
 RECIPE = re.compile(r"[\w.,=+-]+")
+OWN_BASE = re.compile(r"runs(/(?!\.)[\w.+-]+)+")
+KEYS = ("name", "kind", "seeds", "record", "minutes", "fixed", "grid", "cells", "bases")
 
 
 @dataclass(frozen=True)
@@ -76,6 +81,7 @@ class Spec:
     cells: tuple[dict[str, Any], ...]  # every cell's values, `recipe` among them
     record: str = ""
     minutes: float | None = None
+    bases: dict[str, dict[str, Any]] = field(default_factory=dict)  # by folder: what makes it
 
 
 # ---- reading ---------------------------------------------------------------------------------------------------------
@@ -85,12 +91,12 @@ def load_spec(path: str | Path) -> Spec:
     path = Path(path)
     values = _read(path)
     for key in values:
-        if key not in ("name", "kind", "seeds", "record", "minutes", "fixed", "grid", "cells"):
-            raise unknown(f"key of {path.name}", key, ("name", "kind", "seeds", "record", "minutes", "fixed", "grid", "cells"))
+        if key not in KEYS:
+            raise unknown(f"key of {path.name}", key, KEYS)
     for key in ("name", "record"):
         if not (isinstance(values.get(key, "x"), str) and NAME.fullmatch(values.get(key, "x"))):
             raise PdkitError(f"{path.name}: {key} must be a word of letters, digits, dots and dashes, not {values[key]!r}.")
-    for key, kind in (("fixed", dict), ("grid", dict), ("cells", list), ("seeds", list)):
+    for key, kind in (("fixed", dict), ("grid", dict), ("cells", list), ("seeds", list), ("bases", dict)):
         if not isinstance(values.get(key, kind()), kind):
             raise PdkitError(f"{path.name}: {key} must be a {'table' if kind is dict else 'list'}, not {values[key]!r}.")
     if values.get("kind") not in KINDS:
@@ -103,7 +109,12 @@ def load_spec(path: str | Path) -> Spec:
     for given in (seeds, *(cell["seeds"] for cell in cells if "seeds" in cell)):
         if not isinstance(given, list) or not given or any(type(s) is not int or s < 0 for s in given) or len(set(given)) < len(given):
             raise PdkitError(f"{path.name}: seeds must be different whole numbers of 0 or more, not {given!r}.")
-    return Spec(path, name, values["kind"], tuple(seeds), cells, values.get("record", ""), minutes)
+    bases = values.get("bases", {})
+    for folder, base in bases.items():
+        if values["kind"] != "train" or not isinstance(base, dict) or not OWN_BASE.fullmatch(folder):
+            raise PdkitError(f'{path.name}: bases are for trainings: tables by a folder below runs/, such as [bases."runs/base/own"], not '
+                             f"{folder!r}.")
+    return Spec(path, name, values["kind"], tuple(seeds), cells, values.get("record", ""), minutes, bases)
 
 
 def _read(path: Path) -> dict[str, Any]:
@@ -182,19 +193,49 @@ def _with_task(spec: Spec, cell: dict[str, Any], options: Sequence[str]) -> dict
 def _training(spec: Spec, cell: dict[str, Any], seed: int) -> Job:
     cell = _with_task(spec, DEFAULTS | cell, OPTIONS)
     settings = {name: value for name, value in cell.items() if name not in OPTIONS}
-    base = ROOT / cell["base"] if "base" in cell else base_folder(cell["method"], cell["task"])
-    config = method_config(cell["method"], cell["task"], cell["profile"], seed, policy=load_policy(base), **settings)
+    base, weights = _base(spec, cell)
+    config = method_config(cell["method"], cell["task"], cell["profile"], seed, policy=base, **settings)
     if config.demo_fraction:
         _demos(cell)
     words = ["train", "decorated", *_options(OPTIONS, cell), "--seeds", str(seed), *_set(settings)]
     return _job(spec, cell | {"seed": seed}, {"task": cell["task"], "recipe": cell["recipe"], "seed": seed}, words, like=cell["method"],
-                config=flat(config) | {"base": read_card(base)["weights_sha256"]},
+                config=flat(config) | weights,
                 minutes=spec.minutes or expected_minutes(config, cell["episodes"]))
+
+
+def _base(spec: Spec, cell: dict[str, Any]) -> tuple[Policy, dict[str, str]]:
+    """The base policy of a training, and its weights' checksum as `base`; one that has not been made yet is untrained, without one."""
+    if not is_made(cell.get("base", ""), spec):
+        made = _with_task(spec, BASE_DEFAULTS | spec.bases[cell["base"]], BASE_OPTIONS)
+        if made["task"] != cell["task"]:
+            raise PdkitError(f"{spec.path.name}: the base policy {cell['base']} is one of {made['task']}, not {cell['task']}.")
+        _, architecture = configured(made["policy"], _settings(made))
+        return untrained(made["policy"], get_task(made["task"]), architecture), {}
+    folder = ROOT / cell["base"] if "base" in cell else base_folder(cell["method"], cell["task"])
+    return load_policy(folder), {"base": read_card(folder)["weights_sha256"]}
+
+
+def is_made(base: str, spec: Spec) -> bool:
+    """Whether a base policy, the default one (empty) included, is there, or none that the spec makes."""
+    return base not in spec.bases or (ROOT / base / "policy.json").exists()
+
+
+def bases_to_make(spec: Spec, jobs: Sequence[Job]) -> list[Job]:
+    """The jobs that make the base policies which these trainings need and which are not there. Raises PdkitError as `make_jobs` does."""
+    folders = dict.fromkeys(folder for job in jobs if not is_made(folder := job.parameters.get("base", ""), spec))
+    made = [(folder, {"recipe": Path(folder).name} | spec.bases[folder]) for folder in folders]
+    return [replace(_imitation(spec, {name: value for name, value in cell.items() if name != "seed"}, cell.get("seed", 0)), kind="base",
+                    out=folder) for folder, cell in made]
+
+
+def _settings(cell: dict[str, Any]) -> dict[str, Any]:
+    """What a cell of a base policy gives by --set, but for the seed."""
+    return {name: value for name, value in cell.items() if name not in (*BASE_OPTIONS, "recipe", "seed")}
 
 
 def _imitation(spec: Spec, cell: dict[str, Any], seed: int) -> Job:
     cell = _with_task(spec, BASE_DEFAULTS | cell, BASE_OPTIONS)
-    settings = {name: value for name, value in cell.items() if name not in (*BASE_OPTIONS, "recipe")} | {"seed": seed}
+    settings = _settings(cell) | {"seed": seed}
     config, architecture = configured(cell["policy"], settings)
     made_of = untrained(cell["policy"], get_task(cell["task"]), architecture).config
     demos = _demos(cell)
@@ -323,8 +364,23 @@ def _alone(name: str) -> Iterator[None]:
 
 
 def _listing(job: Job) -> str:
-    state = "finished" if finished(job) else "interrupted" if (job.folder / "run").exists() else "to do"
+    state = "to do" if job.out else "finished" if finished(job) else "interrupted" if (job.folder / "run").exists() else "to do"
     return f"{state:11}  {'' if job.minutes is None else f'{job.minutes:4.1f} min'}  {job.command}"
+
+
+def _run(jobs: Sequence[Job], args: argparse.Namespace) -> dict[str, str]:
+    """`sweep` where the command line says."""
+    backend = Ray(args.address, args.workers) if args.ray or args.address else Local()
+    return sweep(jobs, backend, getattr(backend, "limit", args.workers or 2))
+
+
+def _make(bases: Sequence[Job], args: argparse.Namespace) -> None:
+    """Make base policies. Raises PdkitError where one fails: its trainings could not begin."""
+    print("base policies first:", ", ".join(job.out for job in bases), flush=True)
+    for job in bases:
+        job.result.unlink(missing_ok=True)  # it was made once, and its folder is gone
+    for name, problem in _run(bases, args).items():
+        raise PdkitError(f"The base policy {name} could not be made: {problem.rstrip('.')}.")
 
 
 def main(argv: list[str]) -> int:
@@ -355,17 +411,19 @@ def main(argv: list[str]) -> int:
         jobs = [job for job in jobs if not wanted or job.labels[label] in wanted]
     if args.missing:
         jobs = missing(jobs, name)
+    bases = bases_to_make(spec, jobs)
     if args.dry_run:
-        print(*map(_listing, jobs), sep="\n")
+        print(*map(_listing, [*bases, *jobs]), sep="\n")
         return 0
     path = spec.path.resolve()
     command = f"pdkit sweep {path.relative_to(ROOT) if path.is_relative_to(ROOT) else path.name}"
     command += f" --record {args.record}" if args.record else ""
     problems: dict[str, str] | None = None
     with _alone(spec.name):
-        backend = Ray(args.address, args.workers) if args.ray or args.address else Local()
         with contextlib.suppress(KeyboardInterrupt):
-            problems = sweep(jobs, backend, getattr(backend, "limit", args.workers or 2))
+            if bases:
+                _make(bases, args)
+            problems = _run(jobs, args)
         if name:
             print(f"{record_results(name, jobs, command)} rows recorded in data/results/{name}.csv")
     if problems is None:

@@ -49,6 +49,7 @@ class Job:
     config: dict[str, Any] = field(default_factory=dict)  # everything that these parameters amount to today (not of a notebook)
     like: str = ""  # jobs that are alike take alike long: a method, a notebook
     minutes: float | None = None  # expected
+    out: str = ""  # where the command writes; empty: to `run` in the folder
 
     @property
     def name(self) -> str:
@@ -61,7 +62,7 @@ class Job:
     @property
     def command(self) -> str:
         """The line that makes this row again, without the sweep."""
-        return "pdkit " + shlex.join(self.words)
+        return "pdkit " + shlex.join([*self.words, *(["--out", self.out] if self.out else [])])
 
 
 JobFunction = Callable[[Job], dict[str, Any]]
@@ -71,7 +72,7 @@ JobFunction = Callable[[Job], dict[str, Any]]
 
 def run_job(job: Job) -> dict[str, Any]:
     """Run the job's command to its end and return its row, its curve and the settings it ran with. Raises PdkitError."""
-    out, path = job.folder / "run", os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
+    out, path = ROOT / job.out if job.out else job.folder / "run", os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
     with open(job.folder / LOG, "ab") as log:
         start = log.tell()
         process = subprocess.Popen([sys.executable, "-m", "pdkit", *job.words, "--out", str(out)], cwd=ROOT, stdin=subprocess.DEVNULL,

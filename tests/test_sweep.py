@@ -1,7 +1,9 @@
 """Sweeps: refused before anything runs, failures and killed workers cost one job, a second go resumes, Ctrl-C ends children too."""
+import contextlib
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -149,6 +151,9 @@ BASE = {"kind": "base", "fixed": {"task": "Door", "num_demos": 2, "episodes": 2,
         "grid": {"policy": ["mlp", "bet"], "iterations": [3]}}
 
 
+UNMADE = {"fixed": {"task": "Door", "base": "runs/none/own"}}
+
+
 def written(folder: Path, **changes) -> Path:
     path = folder / "spec.json"
     path.write_text(json.dumps({k: v for k, v in (SPEC | changes).items() if v is not None}))
@@ -192,6 +197,9 @@ def test_a_job_is_what_its_command_does(tmp_path):
     assert chunked == json.loads(json.dumps(flat(method_config("policy_decorator", "StackCube", policy=load_policy(ROOT / base))))) | {
         "base": read_card(ROOT / base)["weights_sha256"]}
     assert chunked["gamma"] == 0.922 != config(task="StackCube")["gamma"]
+    unmade = {"runs/none/own": {"task": "StackCube", "policy": "diffusion", "horizon": 8}}  # chunks of 4, as it will have
+    path = written(tmp_path, fixed=dict(task="StackCube", base="runs/none/own"), grid={}, bases=unmade)
+    assert sweep.make_jobs(sweep.load_spec(path))[0].config == {name: value for name, value in chunked.items() if name != "base"}
     shown = "data/demos/TurnFaucetSource.safetensors"
     assert config(task="TurnFaucet", demos=shown)["task"] == "TurnFaucet"
     with pytest.raises(PdkitError, match="holds demonstrations of TurnFaucetSource, not of Door"):
@@ -238,6 +246,14 @@ def test_the_folder_follows_every_parameter_and_nothing_else(tmp_path):
     ({"grid": {"alpha_scale": [[1, 2]]}}, "Give the cell 'alpha_scale=[1, 2]' a recipe"),
     ({"cells": [{"alpha": 0.1, "recipe": "again"}]}, "alpha=0.1 and again are the same job"),
     ({"cells": [{"alpha": 0.2, "recipe": "alpha=0.1"}]}, "are called the same"),
+    ({"bases": {"data/own": {"task": "Door"}}}, "bases are for trainings: tables by a folder below runs/"),
+    ({"bases": {"runs/../own": {"task": "Door"}}}, "not 'runs/../own'"),
+    ({"bases": {"runs/base/own": 3}}, "bases are for trainings"),
+    (BASE | {"bases": {"runs/base/own": {"task": "Door"}}}, "bases are for trainings"),
+    (UNMADE | {"bases": {"runs/none/own": {"policy": "mlp"}}}, "a training needs a task"),
+    (UNMADE | {"bases": {"runs/none/own": {"task": "Pen", "policy": "mlp"}}}, "the base policy runs/none/own is one of Pen, not Door"),
+    (UNMADE | {"bases": {"runs/none/own": {"task": "Door", "policy": "mpl"}}}, "Did you mean 'mlp'"),
+    (UNMADE | {"bases": {"runs/none/own": {"task": "Door", "itrations": 3}}}, "'iterations'?"),
     (BASE | {"fixed": {}}, "a training needs a task"),
     (BASE | {"grid": {"policy": ["bett"]}}, "Did you mean 'bet'?"),
     (BASE | {"grid": {"iterrations": [3]}}, "Did you mean 'iterations'?"),
@@ -469,6 +485,42 @@ def test_base_policies_are_trained_and_tested_and_what_they_solve_becomes_a_row(
     for name, then in (("lr", 0.5), ("hidden", 7), ("demos_checksum", "another file's")):
         write_json(one.result, result | {"settings": result["settings"] | {name: then}})
         assert cli.main(["sweep", str(path)]) == 2 and f"with other values of {name} than" in capsys.readouterr().err
+
+
+@pytest.fixture
+def own_base():
+    """A folder for a base policy where specs may have theirs: below the project's runs/."""
+    folder = f"runs/tests/base-{os.getpid()}"
+    yield folder
+    shutil.rmtree(ROOT / folder, ignore_errors=True)
+    for empty in (ROOT / "runs" / "tests", ROOT / "runs"):
+        with contextlib.suppress(OSError):
+            empty.rmdir()
+
+
+def test_a_base_policy_that_is_not_there_is_made_first(tmp_path, results, capsys, monkeypatch, own_base):
+    made = {"task": "Door", "policy": "mlp", "num_demos": 2, "episodes": 2, "iterations": 3, "batch": 8, "eval_episodes": 0, "seed": 4}
+    path = written(tmp_path, grid=None, cells=[{"recipe": "over", "base": own_base}, {"recipe": "shipped"}], bases={own_base: made})
+    words, makes = ["sweep", str(path), "--record", "over"], ("pdkit train base Door --policy mlp --num-demos 2 --episodes 2 --set "
+                                                              f"iterations=3 batch=8 eval_episodes=0 seed=4 --out {own_base}")
+    one = sweep.make_jobs(sweep.load_spec(path))[0]
+    assert "base" not in one.config
+    assert cli.main([*words, "--dry-run"]) == 0
+    listed = capsys.readouterr().out.splitlines()
+    assert listed[0].endswith(makes) and len(listed) == 3
+    assert cli.main([*words, "--dry-run", "--recipes", "shipped"]) == 0 and makes not in capsys.readouterr().out  # nobody needs it
+    assert cli.main(words) == 0 and f"base policies first: {own_base}\n" in capsys.readouterr().out
+    card = read_card(ROOT / own_base)
+    assert card["info"]["imitate"]["seed"] == 4 and card["kind"] == "mlp"
+    row = pd.read_csv(results / "over.csv").set_index("recipe").loc["over"]
+    assert row.policy == "mlp" and f"--base {own_base} " in row.command
+    assert sweep.make_jobs(sweep.load_spec(path))[0].config["base"] == card["weights_sha256"]
+    assert cli.main(words) == 0 and "base policies" not in capsys.readouterr().out
+    shutil.rmtree(ROOT / own_base)
+    shutil.rmtree(one.folder)
+    monkeypatch.setattr(sweep, "sweep", lambda jobs, backend, limit: {one.name: "It broke." for one in jobs if one.out})
+    assert cli.main(words) == 2
+    assert capsys.readouterr().err == f"The base policy Door {Path(own_base).name} seed 4 could not be made: It broke.\n"
 
 
 # ---- Ray -------------------------------------------------------------------------------------------------------------
