@@ -34,7 +34,8 @@ LEAST_SEEDS = 3
 DECORATOR = "policy_decorator"
 # The paper's baselines of both kinds. Fine-tuning by PPO (the paper has it in D.3 and F.5.1 alone) and the original RLPD are none of them.
 FINE_TUNING = ("sac_finetune", "sac_finetune,actor_lr=1e-4", "rlpd_paper", "rot", "calql")  # the policy's own weights move
-OTHERS = ("residual_rl", "jsrl", "fish")  # baselines that leave it as it is
+FISH = ("fish,features=GPT", "fish")  # by what the paper looks up with, and by raw observations
+OTHERS = ("residual_rl", "jsrl", *FISH)  # baselines that leave it as it is
 VERDICTS = ("not", "partly", "reproduced")  # from the weakest
 NEARLY = 0.95  # success that counts as nearly all (ours; the paper's averages are 98 % and more)
 FLOOR = 0.05  # success below which two sides are not told apart

@@ -261,6 +261,18 @@ def test_fish_is_judged_on_the_tasks_it_has(results, vinn, ends, verdict):
     assert found[:2] == (verdict, "Door") and "BeT 50.0 %" in found[2]
 
 
+def test_fish_counts_by_the_features_that_the_paper_looks_up_by_where_they_are_recorded(results):
+    rows = [{"task": task, "recipe": recipe, "seed": s, "base_success": base, "decorated_success": end}
+            for task, recipe, base, end in (
+                ("Door", "fish", 0.9, 0.9), ("Door", "fish,features=GPT", 0.1, 0.2), ("Door", "policy_decorator", 0.5, 1),
+                ("StackCube", "fish", 0.1, 0.2), ("StackCube", "policy_decorator", 0.5, 1)) for s in range(3)]
+    pd.DataFrame(rows).to_csv(results / "leaderboard.csv", index=False)
+    verdict, tasks, told = verdict_of("FISH fails mainly because")
+    assert (verdict, tasks) == ("partly", "Door StackCube") and "GPT on Door, raw observations on StackCube) 10.0 %" in told
+    pd.DataFrame([row | {"decorated_success": 0.6} for row in rows]).to_csv(results / "leaderboard.csv", index=False)
+    assert verdict_of("FISH fails mainly because")[0] == "not"  # poor below, and FISH above the BeT
+
+
 def test_residual_rl_later_is_judged_at_the_end_of_each_task(results):
     tasks = (("Door", 1_000, [9, 9, 9, 0.1]), ("StackCube", 9_000, [9, 9, 9, 0.1]))
     pd.DataFrame([{"task": task, "recipe": "residual_rl", "seed": s, "base_success": 0.5, "decorated_success": 0.9}
