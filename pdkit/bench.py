@@ -278,7 +278,8 @@ def main(argv: list[str]) -> int:
     device = pick_device(args.device)
     seconds = 0.2 if args.quick else args.seconds
     expected = "1 minute" if args.quick else "5 minutes (7 where ManiSkill can be drawn)"
-    print(f"About {expected} for all parts; {args.threads} thread(s), bfloat16 in hardware: {has_bf16(device)}, updates on {device}.", flush=True)
+    print(f"About {expected} for all parts; {args.threads} thread(s), bfloat16 in hardware: {has_bf16(device)}, updates on {device}.",
+          flush=True)
     results: dict[str, Any] = {}
     ratios = {"step": lambda: bench_step(seconds), "updates": lambda: bench_updates(seconds, device), "base": lambda: bench_base(seconds),
               "imitation": lambda: bench_imitation(seconds, device), "pictures": lambda: bench_pictures(seconds)}
