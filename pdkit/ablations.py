@@ -14,6 +14,7 @@ import pandas as pd
 from .claims import TooLittle, by_seed, difference, judged, weakest
 from .demos import Demos
 from .errors import PdkitError
+from .profiles import online_config
 from .stats import Interval
 
 GRID = "alpha=0.1,H=20000"  # the ablations' recipe that is the lesson's
@@ -84,8 +85,11 @@ def grid(table: pd.DataFrame, column: str = "decorated_success") -> pd.DataFrame
 
 def action_scales(demos: Demos) -> dict[str, float]:
     """Two readings of "the action scale observed in the demonstration dataset" (appendix B.2), averaged over action dimensions and
-    clipped to [-1, 1]: the size of an action, mean |a|, and of a step between two, mean |a_t - a_(t-1)| inside an episode."""
-    episodes = [np.clip(episode["actions"], -1, 1) for episode in demos.episodes()]
+    clipped to [-1, 1]: the size of an action, mean |a|, and of a step between two, mean |a_t - a_(t-1)| inside an episode. Dimensions
+    whose bound is a multiple of alpha in the lesson's recipe (StackCube's gripper: it may be changed wholly) are left out."""
+    scales = online_config(demos.task, "lesson").decorator.alpha_scale
+    bounded = np.broadcast_to(np.asarray(scales or 1.0) <= 1, demos.actions.shape[1:])
+    episodes = [np.clip(episode["actions"][:, bounded], -1, 1) for episode in demos.episodes()]
     steps = np.concatenate([np.abs(np.diff(actions, axis=0)) for actions in episodes])
     return {"mean |a|": float(np.abs(np.concatenate(episodes)).mean()), "mean |a_t - a_(t-1)|": float(steps.mean())}
 

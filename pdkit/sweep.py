@@ -16,7 +16,8 @@ SPEC is a TOML (or JSON) file:
     recipe = "critic-concat"  # optional: what a cell is called; by default the values in which it differs
     seeds = [0]               # optional: its own seeds
     [bases."runs/base/own"]   # optional: base policies that are not shipped, by the folder that cells name as `base`, with what
-    policy = "diffusion"      #   `kind = "base"` takes; a sweep that needs one that is not there makes it first
+    task = "Door"             #   `kind = "base"` takes; a sweep that needs one that is not there makes it first
+    policy = "diffusion"
 
 All cells run with the first seed, then all with the next: a sweep that is stopped early compares them on fewer seeds.
 
@@ -111,9 +112,12 @@ def load_spec(path: str | Path) -> Spec:
             raise PdkitError(f"{path.name}: seeds must be different whole numbers of 0 or more, not {given!r}.")
     bases = values.get("bases", {})
     for folder, base in bases.items():
-        if values["kind"] != "train" or not isinstance(base, dict) or not OWN_BASE.fullmatch(folder):
-            raise PdkitError(f'{path.name}: bases are for trainings: tables by a folder below runs/, such as [bases."runs/base/own"], not '
-                             f"{folder!r}.")
+        if values["kind"] != "train":
+            raise PdkitError(f'{path.name}: bases are for kind = "train", not for {values["kind"]!r}; leave them out.')
+        if not OWN_BASE.fullmatch(folder):
+            raise PdkitError(f'{path.name}: a base policy that a sweep makes lies below runs/, such as "runs/base/own", not in {folder!r}.')
+        if not isinstance(base, dict) or "task" not in base or "recipe" in base:
+            raise PdkitError(f"{path.name}: what makes {folder} is a table with a task, such as task = \"Door\", and without a recipe.")
     return Spec(path, name, values["kind"], tuple(seeds), cells, values.get("record", ""), minutes, bases)
 
 
@@ -223,7 +227,7 @@ def is_made(base: str, spec: Spec) -> bool:
 def bases_to_make(spec: Spec, jobs: Sequence[Job]) -> list[Job]:
     """The jobs that make the base policies which these trainings need and which are not there. Raises PdkitError as `make_jobs` does."""
     folders = dict.fromkeys(folder for job in jobs if not is_made(folder := job.parameters.get("base", ""), spec))
-    made = [(folder, {"recipe": Path(folder).name} | spec.bases[folder]) for folder in folders]
+    made = [(folder, {"recipe": folder.replace("/", "-")} | spec.bases[folder]) for folder in folders]
     return [replace(_imitation(spec, {name: value for name, value in cell.items() if name != "seed"}, cell.get("seed", 0)), kind="base",
                     out=folder) for folder, cell in made]
 
@@ -411,7 +415,7 @@ def main(argv: list[str]) -> int:
         jobs = [job for job in jobs if not wanted or job.labels[label] in wanted]
     if args.missing:
         jobs = missing(jobs, name)
-    bases = bases_to_make(spec, jobs)
+    bases = bases_to_make(spec, [job for job in jobs if not finished(job)])
     if args.dry_run:
         print(*map(_listing, [*bases, *jobs]), sep="\n")
         return 0

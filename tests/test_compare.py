@@ -179,8 +179,12 @@ def test_the_grid():
 
 
 def test_action_scales_stay_inside_an_episode():
-    demos = SimpleNamespace(episodes=lambda: [{"actions": np.array([[0.5], [-2.0]])}, {"actions": np.array([[1.0], [0.0]])}])
+    parts = [np.array([[0.5], [-2.0]]), np.array([[1.0], [0.0]])]
+    demos = SimpleNamespace(task="Door", actions=np.concatenate(parts), episodes=lambda: [{"actions": part} for part in parts])
     assert ablations.action_scales(demos) == pytest.approx({"mean |a|": 2.5 / 4, "mean |a_t - a_(t-1)|": 1.25})  # -2 counts as -1
+    wide = [np.hstack([np.repeat(part, 3, axis=1), -np.ones_like(part)]) for part in parts]  # a gripper, which alpha does not bound
+    cube = SimpleNamespace(task="StackCube", actions=np.concatenate(wide), episodes=lambda: [{"actions": part} for part in wide])
+    assert ablations.action_scales(cube) == pytest.approx(ablations.action_scales(demos))
 
 
 @pytest.mark.parametrize("near, best, base, verdict", [

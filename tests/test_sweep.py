@@ -246,11 +246,12 @@ def test_the_folder_follows_every_parameter_and_nothing_else(tmp_path):
     ({"grid": {"alpha_scale": [[1, 2]]}}, "Give the cell 'alpha_scale=[1, 2]' a recipe"),
     ({"cells": [{"alpha": 0.1, "recipe": "again"}]}, "alpha=0.1 and again are the same job"),
     ({"cells": [{"alpha": 0.2, "recipe": "alpha=0.1"}]}, "are called the same"),
-    ({"bases": {"data/own": {"task": "Door"}}}, "bases are for trainings: tables by a folder below runs/"),
-    ({"bases": {"runs/../own": {"task": "Door"}}}, "not 'runs/../own'"),
-    ({"bases": {"runs/base/own": 3}}, "bases are for trainings"),
-    (BASE | {"bases": {"runs/base/own": {"task": "Door"}}}, "bases are for trainings"),
-    (UNMADE | {"bases": {"runs/none/own": {"policy": "mlp"}}}, "a training needs a task"),
+    ({"bases": {"data/own": {"task": "Door"}}}, "a base policy that a sweep makes lies below runs/"),
+    ({"bases": {"runs/../own": {"task": "Door"}}}, "not in 'runs/../own'"),
+    ({"bases": {"runs/base/own": 3}}, "what makes runs/base/own is a table with a task"),
+    (BASE | {"bases": {"runs/base/own": {"task": "Door"}}}, "bases are for kind = \"train\", not for 'base'; leave them out"),
+    (UNMADE | {"bases": {"runs/none/own": {"policy": "mlp"}}}, "what makes runs/none/own is a table with a task"),
+    (UNMADE | {"bases": {"runs/none/own": {"task": "Door", "recipe": "x"}}}, "without a recipe"),
     (UNMADE | {"bases": {"runs/none/own": {"task": "Pen", "policy": "mlp"}}}, "the base policy runs/none/own is one of Pen, not Door"),
     (UNMADE | {"bases": {"runs/none/own": {"task": "Door", "policy": "mpl"}}}, "Did you mean 'mlp'"),
     (UNMADE | {"bases": {"runs/none/own": {"task": "Door", "itrations": 3}}}, "'iterations'?"),
@@ -520,7 +521,7 @@ def test_a_base_policy_that_is_not_there_is_made_first(tmp_path, results, capsys
     shutil.rmtree(one.folder)
     monkeypatch.setattr(sweep, "sweep", lambda jobs, backend, limit: {one.name: "It broke." for one in jobs if one.out})
     assert cli.main(words) == 2
-    assert capsys.readouterr().err == f"The base policy Door {Path(own_base).name} seed 4 could not be made: It broke.\n"
+    assert capsys.readouterr().err == f"The base policy Door {own_base.replace('/', '-')} seed 4 could not be made: It broke.\n"
 
 
 # ---- Ray -------------------------------------------------------------------------------------------------------------

@@ -319,7 +319,7 @@ def _() -> Finding:
     told = (f"VINN (by {features}) {percent(average(vinn))}{task_by_task(vinn, percent)}, BeT {percent(average(bet))}"
             f"{task_by_task(bet, percent)}, FISH on VINN {percent(average(end))}{task_by_task(end, percent)}")
     return finding("leaderboard", values, told, f"VINN less half of BeT: {points(interval)}",
-                   weakest(judged_over_tasks(-values), "not" if average(end) >= average(bet) else "reproduced"), EIGHT,
+                   weakest(judged_over_tasks(-values), judged_over_tasks(bet - end)), EIGHT,
                    recipes=[*FISH, DECORATOR])
 
 
