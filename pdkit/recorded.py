@@ -143,7 +143,7 @@ def figure(table: pd.DataFrame, curves: pd.DataFrame, task: str = "Door") -> Fig
 
     Runs are named by their recipe where there are several recipes, by their seed otherwise; several recipes with several seeds
     are a line a recipe (the mean), and a bar with a dot a seed. Where recipes start from different successes of one kind of policy,
-    each bar has a tick at its own.
+    which then has no bar of its own, each of their bars has a tick at its start.
     """
     table, curves = table[table.task == task], curves[curves.task == task]
     recipes, several = list(dict.fromkeys(table.recipe)), table.recipe.nunique() > 1
@@ -153,9 +153,11 @@ def figure(table: pd.DataFrame, curves: pd.DataFrame, task: str = "Door") -> Fig
     colors = plt.get_cmap("tab20" if several else "tab10")
     groups = [(r, r, table[table.recipe == r]) for r in recipes] if means else \
         [(f"{r.recipe}, seed {r.seed}" if several else f"seed {r.seed}", r.recipe, table.loc[[i]]) for i, r in table.iterrows()]
-    kinds = table.groupby("policy", sort=False).base_success if "policy" in table else table.groupby("task").base_success
+    kind_of = "policy" if "policy" in table else "task"
+    kinds = table.groupby(kind_of, sort=False).base_success
     bases = {f"base ({kind})" if len(kinds) > 1 else "base": starts.iloc[0] for kind, starts in kinds if starts.nunique() == 1}
-    ticks = {name: rows.base_success.mean() for name, _, rows in groups if len(bases) < len(kinds)}
+    scattered = {kind for kind, starts in kinds if starts.nunique() > 1}
+    ticks = {name: rows.base_success.mean() for name, _, rows in groups if rows[kind_of].iloc[0] in scattered}
     bars = [(name, [value], "0.65") for name, value in bases.items()]
     for i, (name, recipe, rows) in enumerate(groups):
         color = colors(i % colors.N)

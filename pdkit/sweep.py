@@ -46,10 +46,10 @@ from .cli import Parser
 from .demos import Demos, sources
 from .errors import PdkitError, unknown
 from .files import ROOT, read_json, runs_root
-from .imitate import configured, untrained
+from .imitate import ImitateConfig, configured, untrained
 from .main_job import duration, expected_minutes
 from .methods.registry import base_folder, method_config
-from .policies import POLICIES, Policy, load_policy
+from .policies import Policy, load_policy
 from .policies.base import read_card
 from .profiles import flat
 from .runs import NO_MATTER
@@ -213,8 +213,7 @@ def _base(spec: Spec, cell: dict[str, Any]) -> tuple[Policy, dict[str, str]]:
         made = _with_task(spec, BASE_DEFAULTS | spec.bases[cell["base"]], BASE_OPTIONS)
         if made["task"] != cell["task"]:
             raise PdkitError(f"{spec.path.name}: the base policy {cell['base']} is one of {made['task']}, not {cell['task']}.")
-        _, architecture = configured(made["policy"], _settings(made))
-        return untrained(made["policy"], get_task(made["task"]), architecture), {}
+        return _configured(made, _settings(made))[1], {}
     folder = ROOT / cell["base"] if "base" in cell else base_folder(cell["method"], cell["task"])
     return load_policy(folder), {"base": read_card(folder)["weights_sha256"]}
 
@@ -225,11 +224,11 @@ def is_made(base: str, spec: Spec) -> bool:
 
 
 def bases_to_make(spec: Spec, jobs: Sequence[Job]) -> list[Job]:
-    """The jobs that make the base policies which these trainings need and which are not there. Raises PdkitError as `make_jobs` does."""
-    folders = dict.fromkeys(folder for job in jobs if not is_made(folder := job.parameters.get("base", ""), spec))
-    made = [(folder, {"recipe": folder.replace("/", "-")} | spec.bases[folder]) for folder in folders]
-    return [replace(_imitation(spec, {name: value for name, value in cell.items() if name != "seed"}, cell.get("seed", 0)), kind="base",
-                    out=folder) for folder, cell in made]
+    """The jobs that make the base policies which unfinished ones of these trainings need and which are not there. Raises PdkitError as
+    `make_jobs` and `finished` do."""
+    needed = dict.fromkeys(base for job in jobs if not is_made(base := job.parameters.get("base", ""), spec) and not finished(job))
+    cells = {base: {"recipe": base.replace("/", "-")} | spec.bases[base] for base in needed}
+    return [replace(_imitation(spec, cell, cell.get("seed", 0)), kind="base", out=base) for base, cell in cells.items()]
 
 
 def _settings(cell: dict[str, Any]) -> dict[str, Any]:
@@ -237,17 +236,22 @@ def _settings(cell: dict[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in cell.items() if name not in (*BASE_OPTIONS, "recipe", "seed")}
 
 
+def _configured(cell: dict[str, Any], settings: dict[str, Any]) -> tuple[ImitateConfig, Policy]:
+    """How a base policy's cell trains, and the policy before that."""
+    config, architecture = configured(cell["policy"], settings)
+    return config, untrained(cell["policy"], get_task(cell["task"]), architecture)
+
+
 def _imitation(spec: Spec, cell: dict[str, Any], seed: int) -> Job:
     cell = _with_task(spec, BASE_DEFAULTS | cell, BASE_OPTIONS)
     settings = _settings(cell) | {"seed": seed}
-    config, architecture = configured(cell["policy"], settings)
-    made_of = untrained(cell["policy"], get_task(cell["task"]), architecture).config
+    config, policy = _configured(cell, settings)
     demos = _demos(cell)
     demos = demos.first(cell.get("num_demos", demos.num))
     words = ["train", "base", *_options(BASE_OPTIONS, cell), *_set(settings)]
     return _job(spec, cell | {"seed": seed}, {"task": cell["task"], "recipe": cell["recipe"], "seed": seed}, words,
                 like=f"{cell['task']} {cell['policy']}", minutes=spec.minutes,
-                config=asdict(config) | {name: value for name, value in made_of.items() if name not in POLICIES[cell["policy"]].made}
+                config=asdict(config) | {name: value for name, value in policy.config.items() if name not in policy.made}
                 | {"demos_checksum": demos.checksum})
 
 
@@ -415,7 +419,7 @@ def main(argv: list[str]) -> int:
         jobs = [job for job in jobs if not wanted or job.labels[label] in wanted]
     if args.missing:
         jobs = missing(jobs, name)
-    bases = bases_to_make(spec, [job for job in jobs if not finished(job)])
+    bases = bases_to_make(spec, jobs)
     if args.dry_run:
         print(*map(_listing, [*bases, *jobs]), sep="\n")
         return 0

@@ -74,6 +74,16 @@ def test_recipes_that_start_from_different_successes_show_each_its_own():
     assert not [line for line in left.lines if line.get_linestyle() == "--"]
 
 
+def test_only_recipes_whose_kind_of_policy_has_several_starts_have_ticks():
+    """A method from scratch has the row of the base that it was given: a tick there would call that its start."""
+    rows = pd.DataFrame({"task": "Door", "recipe": ["a", "b", "c", "sac_from_scratch"] * 2, "policy": ["vinn", "vinn", "bet", "bet"] * 2,
+                         "seed": [0] * 4 + [1] * 4, "episodes": 60, "base_success": [0.9, 0.8, 0.5, 0.5] * 2, "decorated_success": 0.7})
+    right = recorded.figure(rows, rows[["task", "recipe", "seed"]].assign(step=1_000, success_once=0.6)).axes[1]
+    names = [label.get_text() for label in right.get_yticklabels()]
+    ticks = {names[round(sum(line.get_ydata()) / 2)]: line.get_xdata()[0] / 100 for line in right.lines if line.get_color() == "0.4"}
+    assert ticks == {"a": 0.9, "b": 0.8} and "base (bet)" in names and "base (vinn)" not in names
+
+
 def test_the_manifest_names_every_machine_that_recorded(results, monkeypatch):
     """Of one machine the newest commit; results of another stay labelled with theirs."""
     row = pd.DataFrame({"task": ["Door"], "recipe": ["a"], "seed": [0], "command": ["pdkit x"]})
