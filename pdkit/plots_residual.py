@@ -108,7 +108,7 @@ def lookups_figure(rates: Mapping[str, Rate], bet: Rate, *, recorded: pd.DataFra
     figure, axes = blank(size=(7.8, 1.4 + 0.42 * len(rates)))
     ax, groups = axes[0, 0], list(dict.fromkeys(name.split(",")[0] for name in rates))
     ax.axvspan(bet.low, bet.high, color=COLORS["base"], alpha=0.18, lw=0)
-    ax.axvline(bet.value, color=COLORS["base"], lw=1.4, label=f"{whose} on the same demonstrations")
+    ax.axvline(bet.value, color=COLORS["base"], lw=1.4, label=f"{whose} on the same episodes")
     ax.axvline(bet.value / 2, color=COLORS["lost"], ls="--", lw=1.4, label="half of it: below, extremely poor")
     for y, (name, rate) in enumerate(reversed(rates.items())):
         color = PALETTE[groups.index(name.split(",")[0])]

@@ -159,9 +159,9 @@ def poor_verdict(rates: dict[str, Rate], bet: Rate, features: str = "GPT", whose
     """"VINN on these features performs extremely poorly" (G.2.1), from success rates by the names of `lookups` and the BeT's (on pictures
     another policy's, called `whose`).
 
-    Extremely poor means below half of the BeT's success on the same demonstrations and episodes (ours); the *best* k and buffer of the
-    features counts, so that no bad choice of ours makes the claim true. reproduced: its Wilson interval lies below that half; partly:
-    only its value does; not: it does not. untested: the BeT itself solves nothing.
+    Extremely poor means below half of the BeT's success on the same episodes (ours); the *best* k and buffer of the features
+    counts, so that no bad choice of ours makes the claim true. reproduced: its Wilson interval lies below that half; partly: only its
+    value does; not: it does not. untested: the BeT itself solves nothing.
     """
     best, rate = max(((name, r) for name, r in rates.items() if name.startswith(features + ",")), key=lambda item: item[1].value)
     half = bet.value / 2

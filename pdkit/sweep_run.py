@@ -105,7 +105,13 @@ def _imitated(job: Job, out: Path) -> dict[str, Any]:
     info = card["info"]
     row = {"policy": card["kind"], "demos": info["demos"], "train_minutes": round(info["seconds"] / 60, 2),
            "cores": info["machine"]["cores"], "device": info["device"], "iteration": info["selected"]["iteration"], **info["test"]}
-    return {"row": row, "curve": [], "settings": info["imitate"] | card["config"] | {"demos_checksum": info["demos_checksum"]}}
+    return {"row": row, "curve": [], "settings": base_settings(card)}
+
+
+def base_settings(card: dict[str, Any]) -> dict[str, Any]:
+    """What a base policy was made with, from its policy.json."""
+    info = card["info"]
+    return {"policy": card["kind"], "demos_checksum": info["demos_checksum"]} | info["imitate"] | card["config"]
 
 
 def _played(job: Job, out: Path) -> dict[str, Any]:

@@ -18,7 +18,8 @@ from pdkit.files import DATA
 from pdkit.policies import POLICIES
 from pdkit.probes import PROBES
 from pdkit.seeds import selection_seeds
-from pdkit.sweep import load_spec, make_jobs
+from pdkit.sweep_jobs import make_jobs
+from pdkit.sweep_spec import load_spec
 
 SMALL = {"MLP": analysis.Family("mlp", 60, dict(hidden=16)), "chunked": analysis.Family(
     "diffusion", 60, dict(horizon=4, chunk=2, dims=[8, 16], groups=4, embed=8), dict(lr=3e-3, lr_warmup=0, batch=32))}

@@ -13,7 +13,7 @@ from pdkit.files import DATA
 from pdkit.methods import METHODS
 from pdkit.policies import load_policy
 from pdkit.seeds import reported_seeds
-from pdkit.sweep import load_spec
+from pdkit.sweep_spec import load_spec
 
 
 def runs(recipe, ends, task="Door", base=0.5, **columns):

@@ -20,7 +20,8 @@ from pdkit.files import DATA
 from pdkit.policies import load_policy
 from pdkit.profiles import online_config
 from pdkit.runs import origin
-from pdkit.sweep import load_spec, make_jobs
+from pdkit.sweep_jobs import make_jobs
+from pdkit.sweep_spec import load_spec
 from pdkit.tasks import faucet_assets, get_task
 from pdkit.tasks.faucet import StockTurnFaucetSource, TurnFaucet, TurnFaucetSource, _corners
 from pdkit.tasks.faucet_assets import PARTNET_NOVEL, PARTNET_SOURCE, faucets, with_metadata

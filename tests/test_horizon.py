@@ -16,7 +16,8 @@ from pdkit.files import DATA
 from pdkit.online import Trainer
 from pdkit.probes import PROBES, CorridorSim, zero_base
 from pdkit.profiles import flat, online_config
-from pdkit.sweep import load_spec, make_jobs
+from pdkit.sweep_jobs import make_jobs
+from pdkit.sweep_spec import load_spec
 from pdkit.tasks import get_task, horizon
 from pdkit.tasks.horizon import Ways, horizon_spec, shortened, steps_ahead
 from pdkit.tasks.vector import VectorEnv

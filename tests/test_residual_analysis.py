@@ -12,7 +12,8 @@ from pdkit.errors import PdkitError
 from pdkit.files import DATA
 from pdkit.probes import PROBES, biased_base
 from pdkit.rl.ot import OTReward
-from pdkit.sweep import load_spec, make_jobs
+from pdkit.sweep_jobs import make_jobs
+from pdkit.sweep_spec import load_spec
 
 CLAIMS = report.load_claims(DATA / "results" / "claims.csv")
 

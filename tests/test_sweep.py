@@ -15,7 +15,7 @@ import pandas as pd
 import pytest
 from sweep_jobs import job, play
 
-from pdkit import cli, nb, recorded, sweep, sweep_ray, sweep_run
+from pdkit import cli, nb, recorded, sweep, sweep_jobs, sweep_ray, sweep_run
 from pdkit.errors import PdkitError
 from pdkit.files import DATA, ROOT, read_json, write_json
 from pdkit.main_job import expected_minutes
@@ -25,6 +25,7 @@ from pdkit.policies.base import read_card
 from pdkit.profiles import flat, online_config
 from pdkit.sweep_progress import Progress
 from pdkit.sweep_run import Job, Local, run_jobs
+from pdkit.sweep_spec import load_spec
 
 
 def ran(one: Job) -> int:
@@ -163,7 +164,7 @@ def written(folder: Path, **changes) -> Path:
 def test_cells_are_the_grid_and_the_further_ones_by_each_seed(tmp_path):
     path = written(tmp_path, seeds=[0, 1], grid={"alpha": [0.1, 0.3], "H": [0, 100]},
                    cells=[{"critic_input": "concat"}, {"recipe": "other", "method": "residual_rl"}])
-    jobs = sweep.make_jobs(sweep.load_spec(path))
+    jobs = sweep_jobs.make_jobs(load_spec(path))
     assert len(jobs) == (2 * 2 + 2) * 2 and len({one.folder for one in jobs}) == 12
     assert [one.labels["recipe"] for one in jobs] == 2 * [
         "alpha=0.1,H=0", "alpha=0.1,H=100", "alpha=0.3,H=0", "alpha=0.3,H=100", "critic_input=concat", "other"]
@@ -174,7 +175,7 @@ def test_cells_are_the_grid_and_the_further_ones_by_each_seed(tmp_path):
 
 def test_a_cell_may_have_its_own_seeds(tmp_path):
     path = written(tmp_path, seeds=[1, 0], cells=[{"critic_input": "concat", "seeds": [0]}, {"critic_input": "residual", "seeds": [3, 0]}])
-    jobs = sweep.make_jobs(sweep.load_spec(path))
+    jobs = sweep_jobs.make_jobs(load_spec(path))
     assert [(one.labels["recipe"], one.labels["seed"]) for one in jobs] == [
         ("alpha=0.1", 1), ("alpha=0.3", 1), ("alpha=0.1", 0), ("alpha=0.3", 0), ("critic_input=concat", 0), ("critic_input=residual", 0),
         ("critic_input=residual", 3)]
@@ -184,13 +185,13 @@ def test_a_toml_file_says_the_same_as_a_json_file(tmp_path):
     toml = tmp_path / "spec.toml"
     toml.write_text('name = "tiny"\nkind = "train"\nseeds = [0]\n[fixed]\ntask = "Door"\nprofile = "smoke"\nepisodes = 2\n'
                     "[grid]\nalpha = [0.1, 0.3]\n")
-    assert sweep.make_jobs(sweep.load_spec(toml)) == sweep.make_jobs(sweep.load_spec(written(tmp_path)))
+    assert sweep_jobs.make_jobs(load_spec(toml)) == sweep_jobs.make_jobs(load_spec(written(tmp_path)))
 
 
 def test_a_job_is_what_its_command_does(tmp_path):
     """Over a base policy that acts in chunks, and for a task that is learned from another one's demonstrations."""
     def config(**fixed):
-        return sweep.make_jobs(sweep.load_spec(written(tmp_path, fixed=fixed, grid={})))[0].config
+        return sweep_jobs.make_jobs(load_spec(written(tmp_path, fixed=fixed, grid={})))[0].config
 
     base = "data/checkpoints/StackCube/diffusion"
     chunked = config(task="StackCube", base=base)
@@ -199,7 +200,7 @@ def test_a_job_is_what_its_command_does(tmp_path):
     assert chunked["gamma"] == 0.922 != config(task="StackCube")["gamma"]
     unmade = {"runs/none/own": {"task": "StackCube", "policy": "diffusion", "horizon": 8}}  # chunks of 4, as it will have
     path = written(tmp_path, fixed=dict(task="StackCube", base="runs/none/own"), grid={}, bases=unmade)
-    assert sweep.make_jobs(sweep.load_spec(path))[0].config == {name: value for name, value in chunked.items() if name != "base"}
+    assert sweep_jobs.make_jobs(load_spec(path))[0].config == {name: value for name, value in chunked.items() if name != "base"}
     shown = "data/demos/TurnFaucetSource.safetensors"
     assert config(task="TurnFaucet", demos=shown)["task"] == "TurnFaucet"
     with pytest.raises(PdkitError, match="holds demonstrations of TurnFaucetSource, not of Door"):
@@ -208,7 +209,7 @@ def test_a_job_is_what_its_command_does(tmp_path):
 
 def test_the_folder_follows_every_parameter_and_nothing_else(tmp_path):
     def folder(**changes):
-        return sweep.make_jobs(sweep.load_spec(written(tmp_path, **changes)))[0].folder
+        return sweep_jobs.make_jobs(load_spec(written(tmp_path, **changes)))[0].folder
 
     assert folder() == folder(seeds=[0, 1], grid={"alpha": [0.1]}, minutes=3, record="x")
     different = [folder(), folder(seeds=[1]), folder(grid={"alpha": [0.2]}), folder(fixed=SPEC["fixed"] | {"episodes": 3}),
@@ -300,8 +301,8 @@ def test_bad_options_are_refused(tmp_path, capsys, words, said):
 def test_the_specs_of_the_recorded_results_are_right(name):
     """Each is recorded under its name (or its name's first word: RECORD_TASK), and compares on one task with one budget, the same
     evaluations and at least three seeds."""
-    spec = sweep.load_spec(DATA / "sweeps" / f"{name}.toml")
-    jobs = sweep.make_jobs(spec)
+    spec = load_spec(DATA / "sweeps" / f"{name}.toml")
+    jobs = sweep_jobs.make_jobs(spec)
     assert spec.name == name and spec.record in (name, name.partition("_")[0])
     seeds = {}
     for one in jobs:
@@ -345,7 +346,7 @@ def test_a_real_grid_of_two_trainings_is_recorded_and_skipped_the_second_time(tm
     assert cli.main(["sweep", str(path), "--record", "tiny"]) == 0
     assert "2 jobs, 2 finished, 0 to do" in capsys.readouterr().out and len(pd.read_csv(results / "tiny.csv")) == 2
     # What ran with another recipe than the profile's of today is not passed off as the same.
-    one = sweep.make_jobs(sweep.load_spec(path))[0]
+    one = sweep_jobs.make_jobs(load_spec(path))[0]
     result = read_json(one.result)
     write_json(one.result, result | {"settings": result["settings"] | {"gamma": 0.5, "eval_workers": 9}})
     assert cli.main(["sweep", str(path)]) == 2
@@ -354,7 +355,7 @@ def test_a_real_grid_of_two_trainings_is_recorded_and_skipped_the_second_time(tm
 
 def test_a_training_that_fails_is_told_with_its_own_sentence_and_the_other_is_kept(tmp_path, results, capsys, monkeypatch):
     path = written(tmp_path)
-    broken, fine = sweep.make_jobs(sweep.load_spec(path))
+    broken, fine = sweep_jobs.make_jobs(load_spec(path))
     folder = broken.folder / "run" / "Door-alpha=0.1-seed0"
     write_json(folder / "manifest.json", {"kind": "decorated", "parameters": {"alpha": 0.9}})  # another run is in the way
 
@@ -409,11 +410,11 @@ def test_some_of_the_seeds_and_recipes_alone(tmp_path, capsys):
 def test_missing_leaves_out_what_is_recorded_by_the_same_command_alone(tmp_path, results, capsys, monkeypatch):
     """On another machine there are no run folders, only the recorded rows."""
     path = written(tmp_path)
-    first, second = sweep.make_jobs(sweep.load_spec(path))
-    assert sweep.missing([first, second], "tiny") == [first, second]  # nothing is recorded yet
+    first, second = sweep_jobs.make_jobs(load_spec(path))
+    assert sweep_jobs.missing([first, second], "tiny") == [first, second]  # nothing is recorded yet
     rows = pd.DataFrame([first.labels | {"command": first.command}, second.labels | {"command": second.command + " --set utd=1"}])
     recorded.record("tiny", rows, pd.DataFrame())
-    assert sweep.missing([first, second], "tiny") == [second]
+    assert sweep_jobs.missing([first, second], "tiny") == [second]
     started = []
     monkeypatch.setattr(sweep, "run_jobs", lambda jobs, *_: started.extend(jobs) or {})
     assert cli.main(["sweep", str(path), "--record", "tiny", "--missing"]) == 0
@@ -427,13 +428,13 @@ def test_missing_leaves_out_what_is_recorded_by_the_same_command_alone(tmp_path,
     ("pdkit train decorated Pen --seeds 1 --set alpha=0.1 utd=1", False), ("pdkit train decorated Door --seeds 1 --set alpha=0.1", False),
     ("pdkit train decorated Door --seeds 1 --pixels --set alpha=0.1 utd=1", False)])
 def test_commands_are_the_same_where_what_differs_makes_no_difference(other, same):
-    assert (sweep.essence(other) == sweep.essence("pdkit train decorated Door --seeds 1 --set alpha=0.1 utd=1")) == same
+    assert (sweep_jobs.essence(other) == sweep_jobs.essence("pdkit train decorated Door --seeds 1 --set alpha=0.1 utd=1")) == same
 
 
 def test_the_main_jobs_recorded_rows_are_those_of_its_sweep():
     """They were made one by one, by other words."""
-    spec = sweep.load_spec(DATA / "sweeps" / "main_job.toml")
-    todo = sweep.missing([job for job in sweep.make_jobs(spec) if job.labels["seed"] == 0], "main_job")
+    spec = load_spec(DATA / "sweeps" / "main_job.toml")
+    todo = sweep_jobs.missing([job for job in sweep_jobs.make_jobs(spec) if job.labels["seed"] == 0], "main_job")
     assert not todo
 
 
@@ -475,7 +476,7 @@ def test_base_policies_are_trained_and_tested_and_what_they_solve_becomes_a_row(
     assert table.command["policy=mlp,iterations=3"] == ("pdkit train base Door --policy mlp --num-demos 2 --episodes 2 --set "
                                                         "eval_episodes=0 batch=8 iterations=3 seed=3")
     assert not (results / "bases_curves.csv").exists() and not (results / "bases.png").exists()
-    one = sweep.make_jobs(sweep.load_spec(path))[0]
+    one = sweep_jobs.make_jobs(load_spec(path))[0]
     card = read_card(one.folder / "run")
     assert card["info"]["test"]["episodes"] == 2 and card["info"]["imitate"]["seed"] == 3
     capsys.readouterr()
@@ -504,7 +505,7 @@ def test_a_base_policy_that_is_not_there_is_made_first(tmp_path, results, capsys
     path = written(tmp_path, grid=None, cells=[{"recipe": "over", "base": own_base}, {"recipe": "shipped"}], bases={own_base: made})
     words, makes = ["sweep", str(path), "--record", "over"], ("pdkit train base Door --policy mlp --num-demos 2 --episodes 2 --set "
                                                               f"iterations=3 batch=8 eval_episodes=0 seed=4 --out {own_base}")
-    one = sweep.make_jobs(sweep.load_spec(path))[0]
+    one = sweep_jobs.make_jobs(load_spec(path))[0]
     assert "base" not in one.config
     assert cli.main([*words, "--dry-run"]) == 0
     listed = capsys.readouterr().out.splitlines()
@@ -515,13 +516,32 @@ def test_a_base_policy_that_is_not_there_is_made_first(tmp_path, results, capsys
     assert card["info"]["imitate"]["seed"] == 4 and card["kind"] == "mlp"
     row = pd.read_csv(results / "over.csv").set_index("recipe").loc["over"]
     assert row.policy == "mlp" and f"--base {own_base} " in row.command
-    assert sweep.make_jobs(sweep.load_spec(path))[0].config["base"] == card["weights_sha256"]
+    assert sweep_jobs.make_jobs(load_spec(path))[0].config["base"] == card["weights_sha256"]
     assert cli.main(words) == 0 and "base policies" not in capsys.readouterr().out
-    shutil.rmtree(ROOT / own_base)
     shutil.rmtree(one.folder)
-    monkeypatch.setattr(sweep, "sweep", lambda jobs, backend, limit: {one.name: "It broke." for one in jobs if one.out})
-    assert cli.main(words) == 2
-    assert capsys.readouterr().err == f"The base policy Door {own_base.replace('/', '-')} seed 4 could not be made: It broke.\n"
+    written(tmp_path, grid=None, cells=[{"recipe": "over", "base": own_base}], bases={own_base: made | {"lr": 0.5, "policy": "cnn"}})
+    assert cli.main(words) == 2  # the policy that is there is not the one that the spec describes now
+    differing = "hidden, lr, policy, window"
+    assert capsys.readouterr().err.startswith(f"{own_base} was made with other values of {differing} than spec.json gives it; delete it")
+
+
+def test_a_base_policy_that_cannot_be_made_costs_its_own_trainings_alone(tmp_path, results, capsys, monkeypatch, own_base):
+    made = {"task": "Door", "policy": "mlp", "num_demos": 2, "iterations": 3}
+    cells, ran = [{"recipe": "over", "base": own_base}, {"recipe": "shipped"}], []
+    path = written(tmp_path, grid=None, cells=cells, bases={own_base: made}, minutes=9)
+    monkeypatch.setattr(sweep, "sweep", lambda jobs, *_: ran.append(list(jobs)) or {one.name: "It broke." for one in jobs if one.out})
+    assert cli.main(["sweep", str(path)]) == 1
+    (base,), trained = ran
+    assert [one.labels["recipe"] for one in trained] == ["shipped"] and base.minutes is None  # the spec's are a training's
+    told = f"FAILED Door over seed 0: its base policy could not be made: It broke (log: {base.folder / sweep_run.LOG})"
+    assert told in capsys.readouterr().out.splitlines()
+
+
+def test_a_path_among_the_settings_of_a_base_policy_is_the_projects_wherever_the_sweep_is_started(tmp_path, monkeypatch):
+    cell = {"recipe": "x", "policy": "vinn", "representation": "data/checkpoints/Door/bet-sac"}
+    path = written(tmp_path, **BASE | {"fixed": {"task": "Door"}, "grid": None, "cells": [cell]})
+    monkeypatch.chdir(tmp_path)
+    assert sweep_jobs.make_jobs(load_spec(path))[0].config["representation"]["kind"] == "bet-sac"
 
 
 # ---- Ray -------------------------------------------------------------------------------------------------------------

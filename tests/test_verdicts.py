@@ -3,9 +3,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from pdkit import ablations, claims, report, sweep, verdicts
+from pdkit import ablations, claims, report, verdicts
 from pdkit.files import DATA
 from pdkit.stats import Interval
+from pdkit.sweep_jobs import make_jobs
+from pdkit.sweep_spec import load_spec
 
 CLAIMS = report.load_claims(DATA / "results" / "claims.csv")
 
@@ -636,7 +638,7 @@ def test_a_warm_start_is_judged_at_equal_ages_of_the_actor(results, late, verdic
 
 
 def test_a_warm_start_lasts_as_long_as_two_evaluations_are_apart():
-    jobs = sweep.make_jobs(sweep.load_spec(DATA / "sweeps" / "warm_finetuning.toml"))
+    jobs = make_jobs(load_spec(DATA / "sweeps" / "warm_finetuning.toml"))
     waits = {job.labels["recipe"]: (job.config["critic_warmup"], job.config["eval_every"] * job.config["utd"]) for job in jobs}
     assert waits["warm-fixed"] == waits["warm-learned"] == (verdicts.failures.WARM_UPDATES, verdicts.failures.WARM_UPDATES)
     assert waits["vanilla"][0] == 0

@@ -324,9 +324,9 @@ def _() -> Finding:
 
 
 def _extremely_poor(features: str, record: str = "vinn", yardstick: str = "bet", whose: str = "BeT") -> Finding:
-    """Extremely poorly: below half of the BeT's success on the same demonstrations and episodes (ours, one yardstick for all features of
-    states); on pictures, of the MLP's that was trained on the same ones. The k and buffer with the largest mean count, on each task its
-    own, so that no bad choice of ours makes the claim true."""
+    """Extremely poorly: below half of the BeT's success on the same episodes (ours, one yardstick for all features of states); on
+    pictures, of the MLP's that was trained on the same ones. The k and buffer with the largest mean count, on each task its own, so that
+    no bad choice of ours makes the claim true."""
     table, _ = recorded(record)
     rows = table.assign(recipe="x")
     tried = {name: by_seed(rows, "x", name) for name in rows if name.startswith(f"vinn.{features},") and name.endswith(".value")}
