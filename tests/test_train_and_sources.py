@@ -1,21 +1,24 @@
 """`pdkit train`, `pdkit demos` and the sources of demonstrations."""
 import sys
+from dataclasses import replace
 
 import minari
 import numpy as np
 import pandas as pd
 import pytest
+from worlds import reach_demos
 
 import pdkit.demos.sources as sources
 import pdkit.recorded as recorded
 from pdkit import cli, train
 from pdkit.decorated import load_decorated
-from pdkit.demos import load_demos
+from pdkit.demos import load_demos, save_demos
 from pdkit.errors import PdkitError
 from pdkit.files import DATA
 from pdkit.policies import load_policy
-from pdkit.probes import ProbeBase
+from pdkit.probes import PROBES, ProbeBase
 from pdkit.seeds import reported_seeds
+from pdkit.tasks import TASKS
 from pdkit.tensorboard import Board
 from pdkit.train import parse_settings
 
@@ -177,3 +180,16 @@ def test_tensorboard_gets_every_number_at_its_step(tmp_path):
     assert sorted(events.Tags()["scalars"]) == ["q_mean", "success_once"]
     assert [(e.step, e.value) for e in events.Scalars("q_mean")] == [(100, -2.0), (200, -1.5)]
     assert [(e.step, e.value) for e in events.Scalars("success_once")] == [(100, 0.5)]
+
+
+def test_a_task_of_ones_own_takes_one_entry_in_the_registry(monkeypatch, tmp_path, capsys):
+    """What the README tells: imitated and decorated from the command line, with the defaults of the profile."""
+    monkeypatch.setitem(TASKS, "Mine", replace(PROBES["reach"], name="Mine"))
+    file, base, out = tmp_path / "mine.safetensors", tmp_path / "base", tmp_path / "runs"
+    save_demos(replace(reach_demos(), task="Mine"), file)
+    assert call(monkeypatch, "train", "base", "Mine", "--policy", "mlp", "--demos", str(file), "--out", str(base), "--set", "iterations=20",
+                "eval_episodes=0") == 0
+    assert call(monkeypatch, "train", "decorated", "Mine", "--base", str(base), "--demos", str(file), "--profile", "smoke",
+                "--episodes", "2", "--out", str(out)) == 0
+    assert "task Mine, method policy_decorator" in capsys.readouterr().out
+    assert load_decorated(out / "Mine-lesson-seed0" / "decorated").base.kind == "mlp"
