@@ -190,12 +190,14 @@ def test_a_tuple_is_a_list_a_whole_number_a_number_and_no_hidden_layer_a_linear_
     assert policy.eval().act(np.zeros((2, policy.window, 3), np.float32)).shape == (2, policy.chunk, 2)
 
 
-def test_the_normaliser_has_a_floor_where_it_is_asked_for():
+@pytest.mark.parametrize("kind", [kind for kind, policy in POLICIES.items() if policy.learns and kind != "zero"])
+def test_the_normaliser_has_a_floor_where_it_is_asked_for(kind):
     """Columns: never moves, moves by 0.01, moves by 2; mean 5 each."""
     observations = (5 + np.array([[0, 0.01, 2], [0, -0.01, -2]])).astype(np.float32)
+    few = {"bins": 1} if "bet" in kind else {}
     for floor, expected in ((0.0, [1, 0.01, 2]), (0.5, [1, 0.5, 2])):
-        policy = POLICIES["mlp"]({"obs_dim": 3, "act_dim": 1, "std_floor": floor})
-        policy.fit_statistics(observations, np.zeros((2, 1)))
+        policy = POLICIES[kind]({"obs_dim": 3, "act_dim": 1, "std_floor": floor} | few)
+        policy.fit_statistics(observations, np.zeros((2, 1), np.float32))
         assert policy.normalizer.std.tolist() == pytest.approx(expected, rel=1e-3) and policy.normalizer.mean.tolist() == [5, 5, 5]
     assert policy.normalizer(torch.tensor([[5.0, 5.25, 9.0]])).tolist() == [pytest.approx([0, 0.5, 2])]
 

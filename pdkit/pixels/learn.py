@@ -145,6 +145,6 @@ def renormalise(policy: Policy, observations: np.ndarray) -> None:
     layer = policy.net[0] if isinstance(policy, MLP) else policy.gpt.inp
     assert isinstance(policy, MLP | BeT)
     mean, std = policy.normalizer.mean.clone(), policy.normalizer.std.clone()
-    policy.normalizer.fit(observations, policy.config.get("std_floor", 0.0))
+    policy.normalizer.fit(observations, policy.config["std_floor"])
     layer.bias += layer.weight @ ((policy.normalizer.mean - mean) / std)
     layer.weight *= policy.normalizer.std / std

@@ -75,11 +75,12 @@ def focal_loss(logits: torch.Tensor, target: torch.Tensor, gamma: float) -> torc
 
 class BeT(Policy):
     """The policy. Config: obs_dim, act_dim, window, bins, layers, heads, embed, features, dropout, focal_gamma,
-    offset_weight, act_dropout (leave dropout on when acting, as the paper's code does: facts.md 1.5, trap 3)."""
+    offset_weight, act_dropout (leave dropout on when acting, as the paper's code does: facts.md 1.5, trap 3), std_floor (of the
+    normaliser)."""
 
     kind = "bet"
     defaults: dict[str, Any] = dict(window=10, bins=8, layers=4, heads=4, embed=128, features=256, dropout=0.1, focal_gamma=2.0,
-                                    offset_weight=1000.0, act_dropout=False)
+                                    offset_weight=1000.0, act_dropout=False, std_floor=0.0)
 
     def __init__(self, config: dict[str, Any]):
         super().__init__(config)
@@ -104,7 +105,7 @@ class BeT(Policy):
         """Normaliser from observations (N, obs_dim), bin centres by k-means over actions (N, act_dim)."""
         from sklearn.cluster import KMeans
 
-        self.normalizer.fit(observations)
+        self.normalizer.fit(observations, self.config["std_floor"])
         bins = self.config["bins"]
         if len(actions) < bins:
             raise PdkitError(f"k-means with {bins} bins needs at least {bins} actions, not {len(actions)}; use more demonstrations.")

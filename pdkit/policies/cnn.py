@@ -14,10 +14,10 @@ from .base import Normalizer, Policy
 
 
 class CNN(Policy):
-    """Config: obs_dim, act_dim, window, hidden (channels), layers, kernel (odd, in steps)."""
+    """Config: obs_dim, act_dim, window, hidden (channels), layers, kernel (odd, in steps), std_floor (of the normaliser)."""
 
     kind = "cnn"
-    defaults: dict[str, Any] = dict(window=8, hidden=128, layers=3, kernel=3)
+    defaults: dict[str, Any] = dict(window=8, hidden=128, layers=3, kernel=3, std_floor=0.0)
 
     def __init__(self, config: dict[str, Any]):
         super().__init__(config)
@@ -32,7 +32,7 @@ class CNN(Policy):
 
     def fit_statistics(self, observations: np.ndarray, actions: np.ndarray, seed: int = 0) -> None:
         """Normaliser from observations (N, obs_dim)."""
-        self.normalizer.fit(observations)
+        self.normalizer.fit(observations, self.config["std_floor"])
 
     def loss(self, windows: torch.Tensor, actions: torch.Tensor) -> dict[str, torch.Tensor]:
         """Of the action at the last position alone: the filters see the whole window."""

@@ -34,12 +34,13 @@ class DiffusionPolicy(Policy):
     """Config: obs_dim, act_dim, window (observations), horizon (actions predicted), chunk (of them executed), dims, kernel, groups and
     embed of the U-Net, diffusion_steps of training, prediction ("epsilon", "v_prediction"), sampler ("ddim", "ddpm"), sampler_steps,
     spacing (of DDIM's steps: "leading", "trailing"), late_steps (the last so many steps of sampling have a network of their own; 0: one
-    for all), and own_scale (the network's scale of observations is kept apart from the normaliser's: see `renormalise`)."""
+    for all), own_scale (the network's scale of observations is kept apart from the normaliser's: see `renormalise`), and std_floor (of
+    the normaliser)."""
 
     kind = "diffusion"
     defaults: dict[str, Any] = dict(window=2, horizon=16, chunk=4, dims=[64, 128, 256], kernel=5, groups=8, embed=64, diffusion_steps=100,
                                     prediction="epsilon", sampler="ddim", sampler_steps=4, spacing="leading", late_steps=0,
-                                    own_scale=False)
+                                    own_scale=False, std_floor=0.0)
     least = dict(embed=4, late_steps=0)
     made = ("late_steps", "own_scale")  # by DPPO, and by imitation from pictures
     recipe: dict[str, Any] = dict(lr=1e-4, beta1=0.95, weight_decay=1e-6, schedule="cosine", lr_warmup=500, ema_power=0.75)
@@ -85,7 +86,7 @@ class DiffusionPolicy(Policy):
         return policy.eval()
 
     def fit_statistics(self, observations: np.ndarray, actions: np.ndarray, seed: int = 0) -> None:
-        self.normalizer.fit(observations)
+        self.normalizer.fit(observations, self.config["std_floor"])
 
     def condition(self, windows: torch.Tensor) -> torch.Tensor:
         """What the U-Net sees of windows (N, window, obs_dim): (N, window * obs_dim)."""
@@ -107,7 +108,7 @@ class DiffusionPolicy(Policy):
         No layer could take the change in, as an MLP's first does: the condition goes through Mish first.
         """
         seen = self.seen_scale()
-        self.normalizer.fit(observations)
+        self.normalizer.fit(observations, self.config["std_floor"])
         self.scale.mean.copy_((seen.mean - self.normalizer.mean) / self.normalizer.std)
         self.scale.std.copy_(seen.std / self.normalizer.std)
 

@@ -13,10 +13,11 @@ from .base import Normalizer, Policy
 
 
 class BCRNN(Policy):
-    """Config: obs_dim, act_dim, window, hidden, layers. Every window starts from a state of zeros, in training and in acting alike."""
+    """Config: obs_dim, act_dim, window, hidden, layers, std_floor (of the normaliser). Every window starts from a state of zeros, in
+    training and in acting alike."""
 
     kind = "rnn"
-    defaults: dict[str, Any] = dict(window=10, hidden=256, layers=2)
+    defaults: dict[str, Any] = dict(window=10, hidden=256, layers=2, std_floor=0.0)
 
     def __init__(self, config: dict[str, Any]):
         super().__init__(config)
@@ -28,7 +29,7 @@ class BCRNN(Policy):
 
     def fit_statistics(self, observations: np.ndarray, actions: np.ndarray, seed: int = 0) -> None:
         """Normaliser from observations (N, obs_dim)."""
-        self.normalizer.fit(observations)
+        self.normalizer.fit(observations, self.config["std_floor"])
 
     def _actions(self, windows: torch.Tensor) -> torch.Tensor:
         """An action at every position, (N, window, act_dim)."""
