@@ -18,6 +18,7 @@ Every verdict follows one of few rules, so that no one is tempted to choose the 
 """
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -177,16 +178,15 @@ def not_judged(near_0: Sequence[str], others: Mapping[str, float] | None = None)
 
 
 def best(table: pd.DataFrame, recipes: Sequence[str], column: str = "decorated_success") -> str:
-    """The recipe with the largest mean among those with enough seeds. Raises TooLittle when none has."""
-    means = {}
+    """The recipe with the largest mean of those with enough seeds on the most tasks: a mean over an easy task alone is no rival's to one
+    over all. Raises TooLittle when none has enough."""
+    found = {}
     for recipe in recipes:
-        try:
-            means[recipe] = average(by_seed(table, recipe, column))
-        except TooLittle:
-            continue
-    if not means:
+        with contextlib.suppress(TooLittle):
+            found[recipe] = by_seed(table, recipe, column)
+    if not found:
         raise TooLittle(f"None of {', '.join(recipes)} is recorded with {LEAST_SEEDS} seeds.")
-    return max(means, key=means.get)
+    return max(found, key=lambda recipe: (found[recipe].index.get_level_values("task").nunique(), average(found[recipe])))
 
 
 def evaluations(curves: pd.DataFrame, recipe: str) -> pd.DataFrame:

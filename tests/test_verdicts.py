@@ -164,6 +164,16 @@ def test_another_base_policy_must_rise_by_more_than_20_points(results, kind, rec
     assert verdicts.find(claim) is None
 
 
+def test_the_best_rival_is_one_of_those_on_the_most_tasks():
+    """A mean over an easy task alone does not beat a mean over an easy and a hard one."""
+    both = [runs(recipe, [end] * 3, task=task) for recipe, ends in (("jsrl", (0.8, 0.2)), ("rot", (0.5, 0.4)))
+            for task, end in zip(("Door", "StackCube"), ends, strict=True)]
+    assert claims.best(pd.concat(both), ["jsrl", "rot"]) == "jsrl"
+    easy = [runs("fish", [0.9] * 3), runs("fish", [0.9] * 2, task="StackCube")]  # two seeds are too few
+    assert claims.best(pd.concat([*both, *easy]), ["jsrl", "rot", "fish"]) == "jsrl"
+    assert claims.best(pd.concat([both[0], both[2], *easy]), ["jsrl", "rot", "fish"]) == "fish"
+
+
 def test_a_claim_about_more_tasks_is_partly_reproduced_at_most(results):
     claim = CLAIMS.claim[CLAIMS.claim.str.startswith("With BeT bases")].item()
     tables = [runs("policy_decorator", [1, 0.98, 0.99]), runs("jsrl", [0.7, 0.6, 0.5]), runs("sac_finetune", [0, 0, 0])]

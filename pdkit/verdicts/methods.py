@@ -315,7 +315,8 @@ def _() -> Finding:
     bet = by_seed(runs[runs.task.isin(looked)], DECORATOR, "base_success")
     vinn, end, bet = matched(vinn, end, bet)
     interval, values = difference(vinn, bet / 2)
-    features = ", ".join(f"{'raw observations' if recipe == 'fish' else 'GPT'} on {task}" for task, recipe in looked.items())
+    by = {task: "raw observations" if recipe == "fish" else "GPT" for task, recipe in looked.items()}
+    features = ", ".join(f"{name} on {task}" for task, name in by.items()) if len(set(by.values())) > 1 else by[next(iter(by))]
     told = (f"VINN (by {features}) {percent(average(vinn))}{task_by_task(vinn, percent)}, BeT {percent(average(bet))}"
             f"{task_by_task(bet, percent)}, FISH on VINN {percent(average(end))}{task_by_task(end, percent)}")
     return finding("leaderboard", values, told, f"VINN less half of BeT: {points(interval)}",
