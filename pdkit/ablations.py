@@ -38,7 +38,7 @@ def differences(table: pd.DataFrame, labels: Mapping[str, str], reference: str =
         if recipe == reference or values.empty:
             continue
         try:
-            interval, _ = difference(mine, theirs)
+            interval, values = difference(mine, theirs)
         except TooLittle:
             interval = Interval(values.mean(), np.nan, np.nan)
         rows.append({"recipe": recipe, "label": label, "seeds": len(values), **vars(interval)})

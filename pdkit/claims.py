@@ -192,7 +192,7 @@ def best(table: pd.DataFrame, recipes: Sequence[str], column: str = "decorated_s
 def evaluations(curves: pd.DataFrame, recipe: str) -> pd.DataFrame:
     """The evaluations of a recipe after its first environment step, by time. Raises TooLittle without any.
 
-    At step 0 stands what was learned offline, or nothing.
+    At step 0 stands what the online stage starts from (of Cal-QL's setup E the imitated policy once more), or nothing.
     """
     rows = curves[(curves.recipe == recipe) & (curves.step > 0)]
     if "success_once" not in rows or rows.success_once.isna().all():

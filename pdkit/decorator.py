@@ -24,7 +24,7 @@ ACTOR_INPUTS = ("obs", "obs+base")  # appendix E.1
 class DecoratorConfig:
     """What bounds the residual and what the networks see."""
 
-    alpha: float = 0.1  # bound of the residual per action dimension; the paper's range over tasks is 0.03 to 0.8
+    alpha: float = 0.1  # bound of the residual per action dimension; the official commands' are 0.03 to 0.3
     alpha_scale: tuple[float, ...] = ()  # factors on alpha, one an action dimension (a gripper's, say); empty: all 1
     H: int = 30_000  # primitive steps over which the gate opens; 0 means always open
     critic_input: str = "sum"  # sum: a_base + alpha * a_res; concat: both; residual: alpha * a_res alone

@@ -23,9 +23,10 @@ def demo_rows(demos: Demos, base: Policy, config: OnlineConfig,
               rest: Callable[[np.ndarray], np.ndarray] = np.copy) -> list[np.ndarray]:
     """Demonstrations as replay rows: the residual stored is the one that makes the executed action the demonstrated one.
 
-    An episode ends as training episodes do: at its first success with on_success="terminate", else at its own end, as a
-    time limit (the value of its last state counts). `steps` makes the rows (one lane); `rest` says from an episode's last action what
-    fills its last chunk up (TaskSpec.resting).
+    With on_success="terminate" an episode ends at its first success, as training episodes do; else at its own end, as at a time limit (the
+    value of its last state counts): neither `success_tail` nor `train_limit` cuts it, so that these rows show more of the time after
+    success. `steps` makes the rows (one lane); `rest` says from an episode's last action what fills its last chunk up
+    (TaskSpec.resting).
     """
     steps, rows, chunk = steps or NStep(1, config.n_step, config.gamma), [], base.chunk
     for episode in demos.episodes():

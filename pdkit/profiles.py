@@ -33,13 +33,13 @@ _PAPER_TASK: dict[str, dict[str, Any]] = {
     "StackCube": dict(alpha=0.03, H=1_000_000),
     "PegInsertionSide": dict(alpha=0.3, H=8_000_000, total_steps=10_000_000, actor_lr=3e-4, critic_lr=3e-4),
     "TurnFaucet": dict(alpha=0.2, H=500_000, actor_lr=3e-4, critic_lr=3e-4),
-    "PushChair": dict(alpha=0.2, H=4_000_000, total_steps=6_000_000),
+    "PushChair": dict(alpha=0.2, H=4_000_000, total_steps=6_000_000, xavier_init=True),
 }
 
 # Over a Diffusion Policy, from the official script, which counts chunks as steps (facts.md 1.5, trap 1): `policy_values` turns these
 # counts into primitive steps.
-_PAPER_DIFFUSION: dict[str, Any] = dict(total_steps=4_000_000, warmup_steps=8_000, utd=0.25, alpha=0.1, H=100_000, actor_lr=1e-4,
-                                        critic_lr=1e-4)
+_PAPER_DIFFUSION: dict[str, Any] = dict(total_steps=4_000_000, warmup_steps=8_000, utd=0.25, alpha=0.1, H=100_000, eval_every=50_000,
+                                        actor_lr=1e-4, critic_lr=1e-4)
 _PAPER_DIFFUSION_TASK: dict[str, dict[str, Any]] = {
     "PegInsertionSide": dict(H=30_000), "TurnFaucet": dict(total_steps=2_000_000),
     "PushChair": dict(total_steps=2_000_000, alpha=0.2, H=300_000, gamma=0.9),
@@ -103,7 +103,7 @@ def policy_values(task: str, profile: str, kind: str, chunk: int) -> dict[str, A
     """
     if profile == "paper" and kind == "diffusion":
         values = _PAPER_DIFFUSION | _PAPER_DIFFUSION_TASK.get(task, {})
-        steps = {name: values[name] * chunk for name in ("total_steps", "warmup_steps", "H")}
+        steps = {name: values[name] * chunk for name in ("total_steps", "warmup_steps", "H", "eval_every")}
         return values | steps | {"utd": values["utd"] / chunk}
     if chunk == 1 or profile == "paper":
         return {}

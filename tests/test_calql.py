@@ -6,8 +6,10 @@ import pytest
 import torch
 from test_methods import bet_sac  # noqa: F401 (a fixture)
 from test_probes import success
+from test_sac import iterates
 from worlds import reach_demos, reach_trainer
 
+from pdkit import methods, online
 from pdkit.decorator import DecoratorConfig
 from pdkit.demos import sources
 from pdkit.errors import PdkitError
@@ -211,7 +213,7 @@ def test_mixed_data_are_demonstrations_and_rollouts():
 
 @pytest.mark.parametrize("method", SETUPS)
 def test_setups_are_what_appendix_f3_lists(method, bet_sac):  # noqa: F811
-    trainer, policy = run(method, bet_sac, total_steps=520, utd=0.5)
+    trainer, _ = run(method, bet_sac, total_steps=520, utd=0.5)
     learner = trainer.agent
     assert (trainer._rollouts is not None) == (method == "calql_a")
     assert learner.conservative == (method in ("calql_a", "calql_b")) and trainer.config.on_success == "terminate"
@@ -219,7 +221,7 @@ def test_setups_are_what_appendix_f3_lists(method, bet_sac):  # noqa: F811
     assert isinstance(learner.actor, BeTForSAC) == (method in ("calql_d", "calql"))
     opened = {n for n, p in learner.actor.named_parameters() if p.requires_grad}
     assert (len(opened) == len(list(learner.actor.parameters()))) == (method != "calql")
-    assert trainer_of(method).needs_demos and 0 <= success("reach", policy) <= 1
+    assert trainer_of(method).needs_demos
     assert learner.log_volume == pytest.approx(2 * math.log(0.5) if method == "calql" else 0.0)  # of tanh(u) / scale
 
 
@@ -237,6 +239,25 @@ def test_in_setup_e_the_actor_starts_over_and_the_critics_go_on(bet_sac):  # noq
     assert trainer.agent.critic_optimizer.state  # not made anew
     offline = [r for r in trainer.rows if r["step"] == 0]
     assert len(offline) == 10 and offline[-1]["actor_loss"] != offline[0]["actor_loss"]
+
+
+def test_the_average_of_setup_e_forgets_the_offline_stage(bet_sac):  # noqa: F811
+    """What is evaluated online is the plain mean of the actor's own online steps, not of hundreds of offline ones at the start."""
+    trainer, _ = run("calql", bet_sac)
+    agent = trainer.agent
+    assert agent.actor_steps == 0 < agent.updates
+    draw = lambda: agent.update(trainer.demos.unpack(trainer.demos.draw(32, trainer.generator)), trainer.generator)  # noqa: E731
+    steps, average = iterates(agent, 12, draw)
+    assert len(steps) == agent.actor_steps and torch.allclose(average, steps.mean(dim=0), atol=1e-5)
+
+
+def test_rollouts_start_and_end_where_training_episodes_do(monkeypatch):
+    """From a share of the way on, with the limit that is left (the probe has no way: its starts stay)."""
+    asked = []
+    for module in (methods.calql, online):
+        monkeypatch.setattr(module, "horizon_spec", lambda spec, fraction: asked.append(fraction) or spec)
+    whole, late = (start("calql_a", start_fraction=fraction, train_limit=20)._rollouts for fraction in (0.0, 0.5))
+    assert asked == [0.0, 0.0, 0.5, 0.5] and whole.lengths.max() == 20 and late.lengths.max() == 10
 
 
 def test_offline_all_weights_of_the_transformer_learn(bet_sac):  # noqa: F811

@@ -148,6 +148,8 @@ def test_fine_tuning_stores_windows_and_shows_critics_the_last_observation(bet_s
     assert (windows[:, :, 2:] == windows[:, -1:, 2:]).all()  # the goal does not move within an episode
     assert (windows[:, 1:, :2] != windows[:, :-1, :2]).any() and (rows["base"] == 0).all()
     assert torch.allclose(trainer.agent.critic_view(rows["obs"]), bet_sac.normalizer(windows[:, -1]))
+    raw, _ = run("sac_finetune", bet_sac, total_steps=700, utd=0.0, normalize_obs=False)  # as in the paper profile
+    assert torch.equal(raw.agent.critic_view(rows["obs"]), windows[:, -1])
 
 
 def test_fine_tuning_wants_a_policy_it_can_tune():

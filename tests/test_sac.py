@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from pdkit.decorator import DecoratorConfig
+from pdkit.machine import cpu_has_bf16
 from pdkit.rl.networks import Actor, Critics
 from pdkit.rl.replay import NStep, Replay
 from pdkit.rl.sac import SAC, SACConfig
@@ -198,6 +199,42 @@ def test_averaged_actor_follows_and_is_what_evaluation_uses():
     assert not torch.allclose(agent.average.mean_action(data["obs"]), agent.actor.mean_action(data["obs"]))
 
 
+def iterates(agent, count, update):
+    """The actor's parameters, flat, after each of `count` updates in which it moved, and those of its average then."""
+    flat = lambda module: torch.cat([p.detach().flatten().clone() for p in module.parameters()])  # noqa: E731
+    seen = []
+    for _ in range(count):
+        before = flat(agent.actor)
+        update()
+        if not torch.equal(before, flat(agent.actor)):
+            seen.append(flat(agent.actor))
+    return torch.stack(seen), flat(agent.average)
+
+
+@pytest.mark.parametrize("changes", [{}, {"critic_warmup": 40}, {"actor_every": 2, "critic_warmup": 41}])
+def test_the_average_is_at_first_the_plain_mean_of_where_the_actors_steps_led(changes):
+    """Updates in which the actor waits count for nothing: else the start would have a vote for each of them."""
+    agent, data, g = make(actor_lr=1e-2, **changes), batch(), torch.Generator().manual_seed(0)
+    steps, average = iterates(agent, 80, lambda: agent.update(data, g))
+    assert len(steps) == agent.actor_steps == {0: 80, 40: 40, 41: 19}[agent.config.critic_warmup]
+    assert torch.allclose(average, steps.mean(dim=0), atol=1e-5)
+    again = make(actor_lr=1e-2, **changes)
+    again.load(agent.state())
+    assert again.actor_steps == agent.actor_steps
+
+
+def test_xavier_starts_every_layer_of_its_own_networks_anew():
+    """PushChair in the paper profile: the last layers are then not near zero."""
+    usual, xavier = make(), make(xavier_init=True)
+    for of in (lambda agent: agent.actor.head.weight, lambda agent: agent.critics.members[0][-1].weight):
+        assert of(usual).abs().max() < 0.02 < 0.1 < of(xavier).abs().max() <= math.sqrt(6 / 17) + 1e-6
+    assert all(torch.equal(p, q) for p, q in zip(xavier.critics.parameters(), xavier.targets.parameters(), strict=True))
+    given = Actor(3, 2, 16, 2, False, (-5.0, 2.0))
+    before = given.head.weight.clone()
+    SAC(3, 2, SACConfig(xavier_init=True), DecoratorConfig(), actor=given)
+    assert torch.equal(given.head.weight, before)
+
+
 def test_ensemble_members_are_independent():
     critics = Critics(4, 8, 2, 3, True)
     values = critics(torch.randn(5, 4))
@@ -205,6 +242,7 @@ def test_ensemble_members_are_independent():
     assert not torch.allclose(values[0], values[1])
 
 
+@pytest.mark.skipif(not cpu_has_bf16(), reason="without bfloat16 both are float32")
 def test_bfloat16_learns_like_float32():
     """Equal learning, not equal numbers: a quadratic bandit solved by both to the same place."""
     for bf16 in (False, True):

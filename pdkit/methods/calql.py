@@ -37,6 +37,7 @@ from ..rl.calql import CalQL, Conservative, WithReturns
 from ..rl.replay import Replay
 from ..seeds import rollout_seeds
 from ..tasks import get_task
+from ..tasks.horizon import horizon_spec, shortened
 from .finetune import FineTune
 from .scratch import Scratch
 
@@ -58,8 +59,9 @@ class OfflineFirst:
         self.offline_updates = own.calql_offline_updates
         self._rollouts = None
         if own.calql_data == "mixed":
-            self._rollouts = rollouts(base.eval().to(config.device), spec or get_task(config.task), rollout_seeds(own.calql_rollouts),
-                                      config.train_limit or None)
+            task = horizon_spec(spec or get_task(config.task), config.start_fraction)
+            self._rollouts = rollouts(base.eval().to(config.device), task, rollout_seeds(own.calql_rollouts),
+                                      shortened(config.train_limit, config.start_fraction) or None)
         super().__init__(config, base, demos, spec)
 
     def _make_replay(self, capacity: int) -> Replay:
@@ -101,8 +103,7 @@ class TransformerCalQL(OfflineFirst, FineTune):
     """Setups D and E: a transformer as actor, critics on the last observation, as in fine-tuning."""
 
     def _make_agent(self) -> CalQL:
-        start, dim, normalizer = self._start_policy, self.spec.obs_dim, self.base.normalizer
-        own = self.config.method_config
+        start, own = self._start_policy, self.config.method_config
         if own.calql_pretrained:
             actor = start.with_lora(own.lora)
         else:
@@ -110,5 +111,5 @@ class TransformerCalQL(OfflineFirst, FineTune):
             actor = BeTForSAC(start.config | dict(bins=1, scale=[], lora=0)).eval()
             actor.normalizer.load_state_dict(start.normalizer.state_dict())
             nn.init.zeros_(actor.spread.bias)
-        return self._learner(actor, critic_view=lambda stored: normalizer(stored[:, -dim:]), restart=own.calql_pretrained,
+        return self._learner(actor, critic_view=self._last_observation, restart=own.calql_pretrained,
                              log_volume=float(actor.scale.log().sum()))

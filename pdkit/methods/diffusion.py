@@ -30,10 +30,6 @@ class FineTuneDiffusion(FineTune):
             raise PdkitError(f"{config.method} starts from a Diffusion Policy with one network, and this one was fine-tuned by DPPO: take "
                              "one that was only imitated.")
 
-    def _critic_view(self, stored: torch.Tensor) -> torch.Tensor:
-        """The last, normalised observation (B, obs_dim) of stored windows."""
-        return self.base.normalizer(stored[:, -self.spec.obs_dim:])
-
     def _tensor(self, array: np.ndarray) -> torch.Tensor:
         return torch.from_numpy(np.require(array, np.float32, ["C", "W"])).to(self.config.device)
 

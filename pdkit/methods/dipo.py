@@ -26,7 +26,7 @@ class DIPO(FineTuneDiffusion):
         c, m, start = self.config, self.config.method_config, self._start_policy
         memory = Sequences(self.decisions, self.stored_dim, start.horizon, self.spec.act_dim, c.device)
         return Learner(self.spec.obs_dim, self.act_dim, c.sac, c.decorator, actor=with_lora(start, m.lora), memory=memory,
-                       rule=ActionGradient(m.dipo_steps, m.dipo_lr, m.dipo_norm), critic_view=self._critic_view, device=c.device)
+                       rule=ActionGradient(m.dipo_steps, m.dipo_lr, m.dipo_norm), critic_view=self._last_observation, device=c.device)
 
     def _explore(self, obs: np.ndarray, base: np.ndarray) -> np.ndarray:
         noise = self.rng.standard_normal((len(obs), self._start_policy.horizon, self.spec.act_dim))

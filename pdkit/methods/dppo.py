@@ -27,7 +27,8 @@ class DPPO(OnPolicy, FineTuneDiffusion):
         c, m = self.config, self.config.method_config
         actor = self._start_policy.with_late(m.dppo_steps).requires_grad_(False)
         actor.late = with_lora(actor.late, m.lora)
-        return Learner(self.spec.obs_dim, self.act_dim, m, c.sac, c.decorator, actor=actor, value_view=self._critic_view, device=c.device)
+        return Learner(self.spec.obs_dim, self.act_dim, m, c.sac, c.decorator, actor=actor, value_view=self._last_observation,
+                       device=c.device)
 
     def _make_replay(self, capacity: int) -> Replay:
         c, m, size = self.config, self.config.method_config, self._start_policy.horizon * self.spec.act_dim

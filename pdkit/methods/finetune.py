@@ -12,6 +12,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from ..errors import PdkitError
 from ..online import Trainer
@@ -44,12 +45,18 @@ class FineTune(Trainer):
     def stored_dim(self) -> int:
         return self.spec.obs_dim * self._start_policy.window
 
+    def _last_observation(self, stored: torch.Tensor) -> torch.Tensor:
+        """What small critics see of stored windows (B, stored): the last observation (B, obs_dim), normalised where the configuration
+        says so. (The policy always sees its own normalised ones.)"""
+        last = stored[:, -self.spec.obs_dim:]
+        return self.base.normalizer(last) if self.config.normalize_obs else last
+
     def _make_agent(self) -> SAC:
-        c, m, start, dim, normalizer = self.config, self.config.method_config, self._start_policy, self.spec.obs_dim, self.base.normalizer
+        c, m, start = self.config, self.config.method_config, self._start_policy
         actor = start.with_lora(m.lora)
         if m.critic_backbone == "mlp":
-            return SAC(dim, self.spec.act_dim, c.sac, c.decorator, device=c.device, actor=actor,
-                       critic_view=lambda stored: normalizer(stored[:, -dim:]))
+            return SAC(self.spec.obs_dim, self.spec.act_dim, c.sac, c.decorator, device=c.device, actor=actor,
+                       critic_view=self._last_observation)
         backbone = make_backbone(m.critic_backbone, actor, start, m.lora, c.sac.critic_warmup)
         critics = GPTCritics(backbone, c.decorator.critic_dim(0, self.spec.act_dim), c.sac, c.sac.num_critics)
         return GPTSAC(self.stored_dim, self.spec.act_dim, c.sac, c.decorator, device=c.device, actor=actor, critics=critics)

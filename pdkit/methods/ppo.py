@@ -88,13 +88,13 @@ class PPOFineTune(OnPolicy, FineTune):
     (`critic_backbone`, appendix F.5.1)."""
 
     def _make_agent(self) -> PPO:
-        c, m, dim, start, normalizer = self.config, self.config.method_config, self.spec.obs_dim, self._start_policy, self.base.normalizer
+        c, m, start = self.config, self.config.method_config, self._start_policy
         if start.config["act_dropout"]:
             raise PdkitError("PPO compares probabilities of one decision before and after learning, which dropout would change: "
                              "take a base policy with act_dropout=False.")
         actor = start.with_lora(m.lora)
         if m.critic_backbone == "mlp":
-            return PPO(dim, self.spec.act_dim, m, c.sac, c.decorator, device=c.device, actor=actor,
-                       value_view=lambda stored: normalizer(stored[:, -dim:]))
+            return PPO(self.spec.obs_dim, self.spec.act_dim, m, c.sac, c.decorator, device=c.device, actor=actor,
+                       value_view=self._last_observation)
         value = GPTCritics(make_backbone(m.critic_backbone, actor, start, m.lora), 0, c.sac, 1)
         return PPO(self.stored_dim, self.spec.act_dim, m, c.sac, c.decorator, device=c.device, actor=actor, value=value)

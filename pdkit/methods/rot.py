@@ -6,7 +6,8 @@
 
 The rest is SAC fine-tuning (finetune.py), as in the paper. The original keeps -log pi(a_e | s_e) of a fixed-width Gaussian; the paper
 applies imitation to BeT's whole window and does not say by which loss: here it is the one that BeT was trained by. Width, interval and
-weight are the original's; the paper gives none. Unlike the original, the trunk is the critics' (the paper's words), so it starts untrained.
+weight are the original's; the paper gives none. Unlike the original, the trunk is the critics' (the paper's words), so it starts
+untrained. Each critic's gradient is clipped as in SAC; the trunk's, which they share, is not (the original clips none).
 """
 from __future__ import annotations
 
@@ -49,10 +50,10 @@ class ROT(OTRewarded, FineTune):
     """Fine-tuning with both changes."""
 
     def _make_agent(self) -> ROTAgent:
-        c, m, dim, normalizer = self.config, self.config.method_config, self.spec.obs_dim, self.base.normalizer
+        c, m, dim = self.config, self.config.method_config, self.spec.obs_dim
         critics = TrunkCritics(dim, self.spec.act_dim, m.ot_trunk, c.sac.hidden, c.sac.layers, c.sac.num_critics, c.sac.critic_layer_norm)
         agent = ROTAgent(dim, self.spec.act_dim, c.sac, c.decorator, device=c.device, actor=self._start_policy.with_lora(m.lora),
-                         critics=critics, critic_view=lambda stored: normalizer(stored[:, -dim:]))
+                         critics=critics, critic_view=self._last_observation)
         agent.start, agent.bc_weight, agent.expert_batch = self._start_policy, m.bc_weight, c.batch // 2
         agent.windows = Windows(self._expert, self._start_policy.window, pad_start=True)
         self._phi = copy.deepcopy(critics.trunk).requires_grad_(False)

@@ -106,6 +106,7 @@ class CalQL(SAC):
         weights, trained = self._start
         for actor in (self.actor, self.average):
             actor.load_state_dict(weights)
+        self.actor_steps = 0
         for name, parameter in self.actor.named_parameters():
             parameter.requires_grad_(name in trained)
         c = self.config

@@ -1,4 +1,4 @@
-"""The actor and the critics: 3x256 ReLU networks, as in the paper's code (facts.md 1.3), with LayerNorm as an option."""
+"""The actor and the critics: ReLU networks as in the paper's code (facts.md 1.3: 3x256; the lesson: 2x256), with LayerNorm as an option."""
 from __future__ import annotations
 
 import math
@@ -14,6 +14,12 @@ def mlp(sizes: list[int], layer_norm: bool) -> nn.Sequential:
     for a, b in zip(sizes[:-1], sizes[1:], strict=True):
         layers += [nn.Linear(a, b), *([nn.LayerNorm(b)] if layer_norm else []), nn.ReLU()]
     return nn.Sequential(*layers)
+
+
+def xavier_uniform(module: nn.Module) -> None:
+    """Start a linear layer's weights anew, as facts.md 1.3 tells of PushChair; for `Module.apply`."""
+    if isinstance(module, nn.Linear):
+        nn.init.xavier_uniform_(module.weight)
 
 
 class Actor(nn.Module):

@@ -25,7 +25,7 @@ from torch import nn
 from ..decorator import DecoratorConfig, actor_features, critic_features
 from ..errors import PdkitError, unknown
 from ..torch_setup import autocast
-from .networks import Actor, Critics
+from .networks import Actor, Critics, xavier_uniform
 from .state import pack, unpack
 
 ACTOR_VALUES = ("min", "mean")
@@ -47,6 +47,7 @@ class SACConfig:
     num_critics: int = 2
     critic_layer_norm: bool = True  # DAWN, RLPD: keeps values bounded off the data
     actor_layer_norm: bool = False
+    xavier_init: bool = False  # every layer starts Xavier-uniform, the last ones included (the official code on PushChair)
     log_std_range: tuple[float, float] = (-5.0, 2.0)  # the paper's code: (-20, 2)
     init_temperature: float = 0.01  # the paper's: 1.0
     autotune: bool = True  # learn the temperature
@@ -58,7 +59,7 @@ class SACConfig:
     grad_clip: float = 50.0  # global norm, separately for each critic and the actor
     residual_penalty: float = 1.0  # weight of mean a_res^2 in the actor's loss: no drift where the critic has no preference
     actor_every: int = 2  # critic updates per actor update
-    average: float = 0.9995  # decay of the averaged actor that evaluation uses; 0 evaluates the last weights
+    average: float = 0.9995  # decay, a step of the actor, of the averaged one that evaluation uses; 0 evaluates the last weights
     bf16: bool = True  # autocast to bfloat16 where the hardware has it
     compile: bool = False  # torch.compile of the networks: on a CPU minutes of compiling for 4 %; for CUDA see `pdkit bench`
 
@@ -91,6 +92,8 @@ class SAC:
                                      c.log_std_range)).to(device)
         self.critics = (critics or Critics(decorator.critic_dim(obs_dim, act_dim), c.hidden, c.layers, c.num_critics,
                                            c.critic_layer_norm)).to(device)
+        for own in [part for part, given in ((self.actor, actor), (self.critics, critics)) if given is None and c.xavier_init]:
+            own.apply(xavier_uniform)
         self.targets = copy.deepcopy(self.critics).requires_grad_(False)
         self.average = copy.deepcopy(self.actor).requires_grad_(False)
         if c.compile:
@@ -102,7 +105,7 @@ class SAC:
         self.actor_optimizer = torch.optim.Adam([p for p in self.actor.parameters() if p.requires_grad], lr=c.actor_lr, fused=True)
         self.critic_optimizer = torch.optim.Adam([p for p in self.critics.parameters() if p.requires_grad], lr=c.critic_lr, fused=True)
         self.temperature_optimizer = torch.optim.Adam([self.log_temperature], lr=c.critic_lr, fused=True) if c.autotune else None
-        self.updates = 0
+        self.updates = self.actor_steps = 0  # of everything; of the actor, since it was last as it was given
 
     @torch.no_grad()
     def act(self, obs: torch.Tensor, base: torch.Tensor, noise: torch.Tensor | None = None) -> torch.Tensor:
@@ -170,8 +173,8 @@ class SAC:
             loss.backward()
             torch.nn.utils.clip_grad_norm_(self.actor.parameters(), self.config.grad_clip)
             self.actor_optimizer.step()
+            self._average_actor()
         self._hold_critics(False)
-        self._average_actor()
         entropy = -log_pi.detach().mean()
         if self.temperature_optimizer:
             self.temperature_optimizer.zero_grad(set_to_none=True)
@@ -181,10 +184,11 @@ class SAC:
 
     @torch.no_grad()
     def _average_actor(self) -> None:
-        """Take the actor as it stands into the average."""
+        """Take the actor, which has just moved, into the average."""
+        self.actor_steps += 1
         if self.config.average:
-            # A plain mean at first (decay 1 - 1/k), so that the near-zero start is forgotten quickly.
-            decay = min(self.config.average, 1 - 1 / (self.updates // self.config.actor_every + 1))
+            # A plain mean of where its steps led at first (decay 1 - 1/k), so that the start is forgotten quickly.
+            decay = min(self.config.average, 1 - 1 / self.actor_steps)
             torch._foreach_lerp_(list(self.average.parameters()), list(self.actor.parameters()), 1 - decay)
 
     def _hold_critics(self, hold: bool) -> None:
@@ -207,7 +211,8 @@ class SAC:
 
     def state(self) -> dict[str, torch.Tensor]:
         """Everything that training goes on from, as named tensors."""
-        tensors = {"log_temperature": self.log_temperature.detach(), "updates": torch.tensor(self.updates)}
+        tensors = {"log_temperature": self.log_temperature.detach(), "updates": torch.tensor(self.updates),
+                   "actor_steps": torch.tensor(self.actor_steps)}
         tensors |= pack(self._modules(), self._optimizers())
         return {k: v.detach().cpu().clone().contiguous() for k, v in tensors.items()}
 
@@ -215,7 +220,7 @@ class SAC:
         """Restore what `state` gave."""
         with torch.no_grad():
             self.log_temperature.copy_(tensors["log_temperature"])
-        self.updates = int(tensors["updates"])
+        self.updates, self.actor_steps = (int(tensors[name]) for name in ("updates", "actor_steps"))
         unpack(tensors, self._modules(), self._optimizers())
 
     def _modules(self):
