@@ -106,7 +106,8 @@ class Sampling:
 
 def returns(trainer: FineTune, episodes: int) -> dict[str, torch.Tensor]:
     """Steps of episodes that the starting policy plays with its noise, on seeds of their own: the columns of a replay, and `mc`, the
-    discounted return G (B,). Beyond the training episodes' time limit the last reward is taken to go on for ever."""
+    discounted return G (B,). Beyond the training episodes' time limit the last reward is taken to go on for ever. Actions are those that
+    were executed, cut to [-1, 1], where training rows keep what was drawn."""
     c, dim = trainer.config, trainer.spec.act_dim
     played = rollouts(Sampling(trainer._start_policy), trainer.spec, rollout_seeds(episodes), c.train_limit or None)
     rows = demo_rows(played, trainer.base, c, trainer._view, WithReturns(1, c.n_step, c.gamma))

@@ -37,7 +37,7 @@ _PAPER_TASK: dict[str, dict[str, Any]] = {
 }
 
 # Over a Diffusion Policy, from the official script, which counts chunks as steps (facts.md 1.5, trap 1): `policy_values` turns these
-# counts into primitive steps.
+# counts into primitive steps. Over one that sees pictures the script has other values (batches of 256, bounds, H), which are not here.
 _PAPER_DIFFUSION: dict[str, Any] = dict(total_steps=4_000_000, warmup_steps=8_000, utd=0.25, alpha=0.1, H=100_000, eval_every=50_000,
                                         actor_lr=1e-4, critic_lr=1e-4)
 _PAPER_DIFFUSION_TASK: dict[str, dict[str, Any]] = {

@@ -115,7 +115,8 @@ class BeTForSAC(BeT):
 
     def sample(self, stored: torch.Tensor, noise: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Actions (B, act_dim) for stored, flattened windows (B, window * obs_dim) and standard normal noise (B, act_dim);
-        and log pi (B,) of tanh(u), as SAC has it: the constant log(scale) is left out."""
+        and log pi (B,) of tanh(u), as SAC has it: the constant log(scale) is left out. So a target entropy is one of tanh(u): for the
+        executed action it lies higher by the sum of -log(scale), on Door, where the scale is 0.5 throughout, at -8.6 instead of -28."""
         mean, log_std = self.heads(stored)
         u = mean + log_std.exp() * noise
         log_prob = -0.5 * noise.square() - log_std - 0.5 * math.log(2 * math.pi) - 2 * (math.log(2) - u - F.softplus(-2 * u))
