@@ -32,7 +32,7 @@ from .recorded import KEYS, of_these_objects
 
 COLUMNS = ["claim", "section", "tasks", "seeds", "measured", "interval", "verdict", "command"]
 VERDICTS = {"reproduced": "what the paper says was found", "partly": "found in part, or not yet with certainty",
-            "not": "something else was found, which `measured` tells", "untested": "nothing was run yet"}
+            "not": "something else was found, which `measured` tells", "untested": "nothing was run yet, or what was run does not tell"}
 NEEDED = ("tasks", "seeds", "measured", "interval", "command")  # of a tested claim
 RATES = ("base_success", "base_success_at_end", "decorated_success", "decorated_success_at_end")
 

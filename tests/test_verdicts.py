@@ -137,8 +137,12 @@ def test_every_rule_belongs_to_one_claim():
 
 
 def test_without_results_nothing_is_judged(results):
+    """And what had a verdict before has none any more, but for the rows that no rule judges."""
     assert all(verdicts.find(claim) is None for claim in CLAIMS.claim)
-    assert verdicts.updated(CLAIMS).equals(CLAIMS)
+    by_hand = ~CLAIMS.claim.map(lambda claim: any(claim.startswith(start) for start in verdicts.MEASURES))
+    now = verdicts.updated(CLAIMS)
+    assert now[by_hand].equals(CLAIMS[by_hand]) and set(now.verdict[~by_hand]) == {"untested"}
+    assert (now[~by_hand][["tasks", "seeds", "measured", "interval", "command"]] == "").all(axis=None)
 
 
 @pytest.mark.parametrize("ends, verdict", [([0.9, 0.8, 0.85], "reproduced"), ([0.25, 0.15, 0.28], "not"), ([0.5, 0.2, 0.45], "partly")])

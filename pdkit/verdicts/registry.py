@@ -10,6 +10,7 @@ from ..claims import TASKS, Finding, TooLittle
 Measure = Callable[[], Finding]
 MEASURES: dict[str, Measure] = {}  # first words of a claim -> how it is judged
 EIGHT = TASKS["maniskill"] + TASKS["adroit"]
+UNTESTED = Finding(tasks="", seeds="", measured="", interval="", verdict="untested", command="")
 
 
 def measures(claim: str) -> Callable[[Measure], Measure]:
@@ -21,20 +22,22 @@ def measures(claim: str) -> Callable[[Measure], Measure]:
     return add
 
 
+def _rule(claim: str) -> Measure | None:
+    return next((measure for start, measure in MEASURES.items() if claim.startswith(start)), None)
+
+
 def find(claim: str) -> Finding | None:
     """What is recorded of a claim (its whole sentence), or None where nothing, or too little, is."""
-    for start, measure in MEASURES.items():
-        if claim.startswith(start):
-            try:
-                return measure()
-            except TooLittle:
-                return None
-    return None
+    try:
+        return measure() if (measure := _rule(claim)) else None
+    except TooLittle:
+        return None
 
 
 def updated(claims: pd.DataFrame) -> pd.DataFrame:
-    """The table of claims with every verdict that can be computed; the other rows as they are."""
-    rows = [row | (vars(found) if (found := find(row["claim"])) else {}) for row in claims.to_dict("records")]
+    """The table of claims with the verdict of every rule, "untested" where too little is recorded for it (now); rows without a rule as
+    they are."""
+    rows = [row | (vars(find(row["claim"]) or UNTESTED) if _rule(row["claim"]) else {}) for row in claims.to_dict("records")]
     return pd.DataFrame(rows, columns=claims.columns)
 
 
