@@ -15,7 +15,7 @@ from .errors import PdkitError, unknown
 from .methods.config import MethodConfig
 from .online_config import OnlineConfig
 from .rl.sac import SACConfig
-from .tasks import get_task
+from .tasks import TASKS, get_task
 
 PROFILES = ("smoke", "lesson", "paper")
 
@@ -91,8 +91,9 @@ def profile_values(task: str, profile: str) -> dict[str, Any]:
     get_task(task)
     if profile not in PROFILES:
         raise unknown("profile", profile, PROFILES)
-    lesson = _LESSON | _LESSON_TASK.get(task, {})
-    return {"paper": _PAPER | _PAPER_TASK.get(task, {}), "lesson": lesson, "smoke": lesson | _SMOKE}[profile]
+    like = next((spec.name for spec in TASKS.values() if spec.demo_task == task), task)  # a task of other objects: as with those
+    lesson = _LESSON | _LESSON_TASK.get(like, {})
+    return {"paper": _PAPER | _PAPER_TASK.get(like, {}), "lesson": lesson, "smoke": lesson | _SMOKE}[profile]
 
 
 def policy_values(task: str, profile: str, kind: str, chunk: int) -> dict[str, Any]:

@@ -140,11 +140,12 @@ def test_the_exercise_names_the_likely_mistakes(capsys):
             actions = moved[executed].clone().requires_grad_()
             gradient = torch.autograd.grad(value(actions), actions)[0]
             moved[part] = moved[part] + sign * lr * (gradient.repeat(3, 1)[: len(moved)] if whole else gradient)
-            moved = moved.clamp(-1, 1) if clamp else moved
-        return moved
+            moved = moved.clamp(-1, 1) if clamp is True else moved
+        return moved.clamp(-1, 1) if clamp == "last" else moved
 
     assert check.action_ascent(climb)
     for wrong, words in ((lambda *a: climb(*a, sign=-1.0), "add the gradient"), (lambda *a: climb(*a, clamp=False), "clamp them"),
+                         (lambda *a: climb(*a, clamp="last"), "at the end alone"),
                          (lambda *a: climb(*a, copy=False), "work on a copy"), (lambda *a: climb(*a, whole=True), "outside the executed"),
                          (lambda v, s, e, n, lr: climb(v, s, e, 1, lr), "that is one step"), (lambda v, s, *_: s.clone(), "nothing moves"),
                          (lambda *a: climb(*a)[a[2]], "the whole sequence"), (lambda *a: 0.9 * climb(*a), "outside the executed")):

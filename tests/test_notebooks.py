@@ -358,7 +358,7 @@ def test_exercises_accept_solutions_and_name_mistakes(capsys):
         return losses.mean() if mean else losses.sum()
 
     def gate(residual, step, H, rng, shape=1, opposite=False):
-        p = min(step / H, 1)
+        p = min(step / H, 1) if H else 1
         draw = rng.random((len(residual), residual.shape[1] if shape == 2 else 1))
         return residual * ((draw >= p) if opposite else (draw < p))
 
@@ -392,6 +392,8 @@ def test_exercises_accept_solutions_and_name_mistakes(capsys):
         (check.gate, lambda *a: gate(*a, shape=2), "single dimensions"),
         (check.gate, lambda *a: gate(*a, opposite=True), "chance to be ON"),
         (check.gate, lambda r, s, H, g: r * min(s / H, 1), "scales"),
+        (check.gate, lambda r, s, H, g: gate(r, s, H, g) if H else 0 * r, "always open"),
+        (check.gate, lambda r, s, H, g: gate(r, s, H, g) if s / H else r, "ZeroDivisionError"),
         (check.gate, lambda r, s, H, g: r * (g.random() < s / H), "together"),
         (check.cosines, unlearning.cosines, "solved"),
         (check.cosines, lambda a, b: (a * b).sum(1), "dot product"),
@@ -420,8 +422,11 @@ def test_exercises_accept_solutions_and_name_mistakes(capsys):
         (check.corridor_values, lambda n, g: g ** np.arange(n), "wrong way round"),
         (check.corridor_values, lambda n, g: g ** np.arange(n, 0, -1.0), "no discount"),
         (check.corridor_values, lambda n, g: g ** (n - 1), "shape"),
-        (lambda a, strict=False: check.ranking(a, finals, strict), lambda: ["a", "c", "b"], "solved"),
-        (lambda a, strict=False: check.ranking(a, finals, strict), lambda: ["c", "a", "b"], "solved"),  # 5 points are a tie
+        (lambda a, strict=False: check.ranking(a, finals, strict), lambda: [["a", "c"], "b"], "solved"),
+        (lambda a, strict=False: check.ranking(a, finals, strict), lambda: [["c", "a"], ["b"]], "solved"),
+        (lambda a, strict=False: check.ranking(a, finals, strict), lambda: ["c", "a", "b"], "c and a end within 10 points"),
+        (lambda a, strict=False: check.ranking(a, finals, strict), lambda: [["a", "b", "c"]], "c and b do not end alike: 65 points"),
+        (lambda a, strict=False: check.ranking(a, dict(a=0.5, b=0.55), strict), lambda: ["a", "b"], "a and b end within 10 points"),
         (lambda a, strict=False: check.ranking(a, finals, strict), lambda: ["b", "a", "c"], "most clearly b before a, by 70 points"),
         (lambda a, strict=False: check.ranking(a, finals, strict), lambda: ["a", "b"], "each of a, b, c once"),
         (lambda a, strict=False: check.ranking(a, {"a": np.nan}, strict), lambda: ["a"], "nothing is recorded"),

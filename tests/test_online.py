@@ -14,7 +14,7 @@ from pdkit.online import Trainer, demo_rows
 from pdkit.online_config import OnlineConfig, stops
 from pdkit.policies import BeT
 from pdkit.probes import PROBES, biased_base
-from pdkit.profiles import differences, flat, online_config
+from pdkit.profiles import differences, flat, online_config, policy_values
 from pdkit.rl.sac import SACConfig
 from pdkit.runs import Run
 
@@ -353,6 +353,16 @@ def test_the_paper_profile_is_the_official_recipe():
     assert (c.sac.layers, c.sac.hidden, c.sac.actor_every, c.sac.residual_penalty) == (3, 256, 1, 0.0)
     assert (c.train_limit, c.success_tail, c.lr_decay_from, c.normalize_obs) == (0, 0, 1.0, False)
     assert (c.decorator.critic_input, c.decorator.actor_input, c.sac.critic_layer_norm, c.sac.average) == ("sum", "obs", False, 0.0)
+    assert [online_config(task, "paper").sac.xavier_init for task in ("PushChair", "TurnFaucet")] == [True, False]
+    chunks = policy_values("TurnFaucet", "paper", "diffusion", 4)  # the script counts chunks
+    assert (chunks["total_steps"], chunks["eval_every"]) == (8_000_000, 200_000)
+
+
+@pytest.mark.parametrize("profile", ["lesson", "paper"])
+@pytest.mark.parametrize("task", ["TurnFaucet", "PushChair"])
+def test_a_task_of_other_objects_has_the_values_of_its_twin(task, profile):
+    novel, source = (dataclasses.asdict(online_config(name, profile)) for name in (task, f"{task}Source"))
+    assert novel.pop("task") != source.pop("task") and novel == source and novel["decorator"]["alpha"] != DecoratorConfig().alpha
 
 
 def test_decorated_policy_survives_the_disk(tmp_path):

@@ -30,6 +30,10 @@ def gate(answer: Callable, strict: bool = False) -> bool:
             yield f"at a quarter of H a share of {share:.2f} is on, not 0.25."
         if (np.asarray(answer(residual.copy(), 5000, 1000, np.random.default_rng(0))) == 0).any():
             yield "beyond H something is still off; the probability stops at 1."
+        with np.errstate(divide="ignore", invalid="ignore"):
+            always = np.asarray(answer(residual.copy(), 0, 0, np.random.default_rng(0)))
+        if (always != 1).any():
+            yield "with H = 0 the gate is always open, from step 0 on."
 
     return judge("gate", complaints, strict)
 
@@ -181,20 +185,20 @@ def action_ascent(answer: Callable, strict: bool = False) -> bool:
     """12: a sequence (horizon, act_dim) whose `executed` part climbed a value by plain gradient steps, clamped to [-1, 1] after each."""
     def complaints() -> Iterator[str]:
         goal = torch.tensor([[0.3, 1.4], [-0.2, 0.6]])
-        start, executed = torch.linspace(-0.8, 0.6, 10).view(5, 2), slice(1, 3)
+        start, executed, count = torch.linspace(-0.8, 0.6, 10).view(5, 2), slice(1, 3), 5
 
         def value(actions: torch.Tensor) -> torch.Tensor:
-            return -(actions - goal).square().sum()
+            return -(actions - goal).square().sum() + actions.prod(dim=1).sum()  # one number's way depends on where the other is
 
         def climbed(steps: int, sign: float = 1.0, clamp: str = "each") -> torch.Tensor:
             moved = start.clone()
             for _ in range(steps):
-                moved[executed] += sign * 0.2 * -2 * (moved[executed] - goal)
+                moved[executed] += sign * 0.2 * (-2 * (moved[executed] - goal) + moved[executed].flip(1))
                 moved = moved.clamp(-1, 1) if clamp == "each" else moved
             return moved.clamp(-1, 1) if clamp == "last" else moved
 
         given = start.clone()
-        got = torch.as_tensor(answer(value, given, executed, 3, 0.2)).detach()
+        got = torch.as_tensor(answer(value, given, executed, count, 0.2)).detach()
         if got.shape != start.shape:
             yield f"it gives shape {tuple(got.shape)}, not {tuple(start.shape)}: the whole sequence, with its executed part moved."
         if not torch.equal(given, start):
@@ -203,11 +207,13 @@ def action_ascent(answer: Callable, strict: bool = False) -> bool:
             yield "actions outside the executed part moved: the critic knows nothing of them."
         if torch.allclose(got, start):
             yield "nothing moves: is the gradient taken for the executed part, and added?"
-        if not torch.allclose(got, climbed(3), atol=1e-5):
-            mistakes = ((climbed(3, sign=-1.0), "it goes down: add the gradient."),
-                        (climbed(3, clamp="no"), "actions leave [-1, 1]: clamp them."),
+        if not torch.allclose(got, climbed(count), atol=1e-5):
+            mistakes = ((climbed(count, sign=-1.0), "it goes down: add the gradient."),
+                        (climbed(count, clamp="no"), "actions leave [-1, 1]: clamp them."),
+                        (climbed(count, clamp="last"), "it clamps at the end alone: in between the critic judges actions outside [-1, 1]."),
                         (climbed(1), "that is one step; take all of them, each with a new gradient."))
+            first, right = float(got[1, 0]), float(climbed(count)[1, 0])
             yield next((said for wrong, said in mistakes if torch.allclose(got, wrong, atol=1e-5)),
-                       f"after 3 steps of 0.2 the first executed number is {float(got[1, 0]):.3f}, not {float(climbed(3)[1, 0]):.3f}.")
+                       f"after {count} steps of 0.2 the first executed number is {first:.3f}, not {right:.3f}.")
 
     return judge("action_ascent", complaints, strict)

@@ -1,6 +1,7 @@
 """Exercises about results and what they say (notebooks 13, 14, 16)."""
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterator, Mapping
 
 import numpy as np
@@ -10,9 +11,11 @@ from .judge import judge
 
 
 def ranking(answer: Callable, recorded: Mapping[str, float], strict: bool = False) -> bool:
-    """13: the recipes of `recorded` (recipe -> mean success) in the order predicted, best first; pairs closer than 10 points are ties."""
+    """13: the recipes of `recorded` (recipe -> mean success) in the order predicted, best first; those in a list of their own are
+    predicted to end alike, each within 10 points of the next."""
     def complaints() -> Iterator[str]:
-        got = list(answer())
+        groups = [[entry] if isinstance(entry, str) else list(entry) for entry in answer()]
+        got = [name for group in groups for name in group]
         if sorted(got) != sorted(recorded):
             yield f"it must name each of {', '.join(recorded)} once, and gives {got}."
         if any(np.isnan(value) for value in recorded.values()):
@@ -22,6 +25,14 @@ def ranking(answer: Callable, recorded: Mapping[str, float], strict: bool = Fals
             gap, first, second = max(wrong)
             yield (f"{len(wrong)} of {len(got) * (len(got) - 1) // 2} pairs came out the other way round, most clearly {first} before "
                    f"{second}, by {100 * gap:.0f} points. Which of your reasons was wrong?")
+        for i, group in enumerate(groups):
+            for worse, better in itertools.pairwise(sorted(group, key=recorded.__getitem__)):
+                if (gap := recorded[better] - recorded[worse]) > 0.1:
+                    yield f"{better} and {worse} do not end alike: {100 * gap:.0f} points lie between them."
+            told = [(a, b) for other in groups[i + 1:] for a in group for b in other if recorded[a] - recorded[b] <= 0.1]
+            if told:
+                yield (f"{told[0][0]} and {told[0][1]} end within 10 points of each other: put them into one list. Which of your reasons "
+                       "made you expect more?")
 
     return judge("ranking", complaints, strict)
 

@@ -77,7 +77,7 @@ def chair(obs: torch.Tensor) -> torch.Tensor:
 
 FEATURES: dict[str, tuple[int, Callable[[torch.Tensor], torch.Tensor]]] = {  # task: how many, and which
     "PegInsertionSide": (20, peg),
-    "PushChair": (18, chair),
+    "PushChair": (18, chair), "PushChairSource": (18, chair),
 }
 
 
