@@ -20,19 +20,20 @@ def ranking(answer: Callable, recorded: Mapping[str, float], strict: bool = Fals
             yield f"it must name each of {', '.join(recorded)} once, and gives {got}."
         if any(np.isnan(value) for value in recorded.values()):
             yield "nothing is recorded to hold it against: keep your prediction, and run the sweep that is named above."
-        wrong = [(recorded[b] - recorded[a], a, b) for i, a in enumerate(got) for b in got[i + 1:] if recorded[b] - recorded[a] > 0.1]
+        pairs = [(a, b) for i, group in enumerate(groups) for other in groups[i + 1:] for a in group for b in other]
+        wrong = [(recorded[b] - recorded[a], a, b) for a, b in pairs if recorded[b] - recorded[a] > 0.1]
         if wrong:
             gap, first, second = max(wrong)
-            yield (f"{len(wrong)} of {len(got) * (len(got) - 1) // 2} pairs came out the other way round, most clearly {first} before "
+            yield (f"{len(wrong)} of {len(pairs)} pairs came out the other way round, most clearly {first} before "
                    f"{second}, by {100 * gap:.0f} points. Which of your reasons was wrong?")
-        for i, group in enumerate(groups):
+        for group in groups:
             for worse, better in itertools.pairwise(sorted(group, key=recorded.__getitem__)):
                 if (gap := recorded[better] - recorded[worse]) > 0.1:
                     yield f"{better} and {worse} do not end alike: {100 * gap:.0f} points lie between them."
-            told = [(a, b) for other in groups[i + 1:] for a in group for b in other if recorded[a] - recorded[b] <= 0.1]
-            if told:
-                yield (f"{told[0][0]} and {told[0][1]} end within 10 points of each other: put them into one list. Which of your reasons "
-                       "made you expect more?")
+        for first, second in pairs:
+            if recorded[first] - recorded[second] <= 0.1:
+                yield (f"{first} and {second} end within 10 points of each other: put them into one list. Which of your reasons made you "
+                       "expect more?")
 
     return judge("ranking", complaints, strict)
 
