@@ -74,6 +74,9 @@ class GPTSAC(SAC):
     def _hold_critics(self, hold: bool) -> None:
         self.critics.hold(hold)
 
+    def _actor_moves(self) -> bool:
+        return super()._actor_moves() or self.critics.backbone.gpt is self.actor.gpt  # a shared one moves with the critics' every step
+
     def _clipped(self) -> list[nn.Module]:
         return [*self.critics.members, self.critics.backbone]
 

@@ -173,14 +173,19 @@ class SAC:
             loss.backward()
             torch.nn.utils.clip_grad_norm_(self.actor.parameters(), self.config.grad_clip)
             self.actor_optimizer.step()
-            self._average_actor()
         self._hold_critics(False)
+        if self._actor_moves():
+            self._average_actor()
         entropy = -log_pi.detach().mean()
         if self.temperature_optimizer:
             self.temperature_optimizer.zero_grad(set_to_none=True)
             (self.log_temperature * (entropy - self.target_entropy)).backward()
             self.temperature_optimizer.step()
         return {"actor_loss": loss.detach(), "entropy": entropy, "temperature": temperature, "residual_abs": residual.detach().abs().mean()}
+
+    def _actor_moves(self) -> bool:
+        """Whether this update moves the actor, or it stands still while the critics warm up."""
+        return self.updates >= self.config.critic_warmup
 
     @torch.no_grad()
     def _average_actor(self) -> None:
