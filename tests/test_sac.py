@@ -242,21 +242,20 @@ def test_ensemble_members_are_independent():
     assert not torch.allclose(values[0], values[1])
 
 
-@pytest.mark.skipif(not cpu_has_bf16(), reason="without bfloat16 both are float32")
-def test_bfloat16_learns_like_float32():
+@pytest.mark.parametrize("bf16", [False, pytest.param(True, marks=pytest.mark.skipif(not cpu_has_bf16(), reason="no bfloat16 here"))])
+def test_bfloat16_learns_like_float32(bf16):
     """Equal learning, not equal numbers: a quadratic bandit solved by both to the same place."""
-    for bf16 in (False, True):
-        settings = SACConfig(hidden=64, bf16=bf16, critic_lr=3e-3, actor_lr=3e-3, residual_penalty=0.0, average=0.95)
-        agent = SAC(3, 2, settings, DecoratorConfig(alpha=1.0, H=0))
-        g = torch.Generator().manual_seed(0)
-        for _ in range(400):
-            action = torch.rand((128, 2), generator=g) * 2 - 1
-            reward = -((action - torch.tensor([0.5, -0.25])) ** 2).sum(-1)
-            zeros = torch.zeros(128, 2)
-            agent.update(dict(obs=torch.zeros(128, 3), residual=action, base=zeros, reward=reward, next_obs=torch.zeros(128, 3),
-                              next_base=zeros, discount=torch.zeros(128)), g)
-        found = agent.act(torch.zeros(1, 3), torch.zeros(1, 2))[0]
-        assert torch.allclose(found, torch.tensor([0.5, -0.25]), atol=0.15), (bf16, found)
+    settings = SACConfig(hidden=64, bf16=bf16, critic_lr=3e-3, actor_lr=3e-3, residual_penalty=0.0, average=0.95)
+    agent = SAC(3, 2, settings, DecoratorConfig(alpha=1.0, H=0))
+    g = torch.Generator().manual_seed(0)
+    for _ in range(400):
+        action = torch.rand((128, 2), generator=g) * 2 - 1
+        reward = -((action - torch.tensor([0.5, -0.25])) ** 2).sum(-1)
+        zeros = torch.zeros(128, 2)
+        agent.update(dict(obs=torch.zeros(128, 3), residual=action, base=zeros, reward=reward, next_obs=torch.zeros(128, 3),
+                          next_base=zeros, discount=torch.zeros(128)), g)
+    found = agent.act(torch.zeros(1, 3), torch.zeros(1, 2))[0]
+    assert torch.allclose(found, torch.tensor([0.5, -0.25]), atol=0.15), (bf16, found)
 
 
 def transition(queue, t, stop=False, done=False):
