@@ -142,12 +142,14 @@ def figure(table: pd.DataFrame, curves: pd.DataFrame, task: str = "Door") -> Fig
     """Left: evaluations on selection seeds during training, a line a run. Right: success on the test seeds, with intervals.
 
     Runs are named by their recipe where there are several recipes, by their seed otherwise; several recipes with several seeds
-    are a line a recipe (the mean), and a bar with a dot a seed. Where recipes start from different successes of one kind of policy,
-    which then has no bar of its own, each of their bars has a tick at its start.
+    are a line a recipe (the mean), and a bar with a dot a seed, the best on top. Where recipes start from different successes of one
+    kind of policy, which then has no bar of its own, each of their bars has a tick at its start.
     """
     table, curves = table[table.task == task], curves[curves.task == task]
     recipes, several = list(dict.fromkeys(table.recipe)), table.recipe.nunique() > 1
     means = several and len(table) > len(recipes)
+    if means:
+        recipes = list(table.groupby("recipe", sort=False).decorated_success.mean().sort_values(ascending=False, kind="stable").index)
     height = max(4.4 if several else 3.6, 0.22 * (len(recipes) if means else len(table)))
     fig, (left, right) = plt.subplots(1, 2, figsize=(10, height), width_ratios=(3, 2), layout="constrained")
     colors = plt.get_cmap("tab20" if several else "tab10")
