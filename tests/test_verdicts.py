@@ -715,6 +715,9 @@ def test_diffusion_policy_is_judged_on_both_tasks_that_have_enough_seeds(results
               runs("policy_decorator", [0.0] * 3, task="StackCube", base=0.6))
         found = verdicts.find(claim)
         assert found.tasks == tasks and found.measured.startswith(start) and found.command.count("pdkit sweep") == len(tasks.split())
+    write(results, "diffusion_tasks", *(runs("policy_decorator", [0.9, 0.92, 0.94], task=task, base=0.1) for task in ("Hammer", "Pen")))
+    found = verdicts.find(claim)
+    assert found.tasks == "StackCube Door Hammer Pen" and found.measured.startswith("25.0 %") and found.seeds == "0 1 2"
 
 
 def test_a_method_with_one_seed_on_a_task_is_not_judged_there(results):

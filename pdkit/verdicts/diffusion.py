@@ -1,7 +1,7 @@
-"""Diffusion Policy bases: decorated, or fine-tuned by DIPO and DPPO (data/sweeps/diffusion_finetuning.toml, diffusion_door.toml).
+"""Diffusion Policy bases: decorated (data/sweeps/diffusion_tasks.toml), or also fine-tuned by DIPO and DPPO (diffusion_finetuning.toml on
+StackCube, diffusion_door.toml).
 
-Fig. 1 gives means over three ManiSkill and three Adroit tasks (facts.md 4.1); StackCube and Door are planned here, so nothing is more than
-partly reproduced by the first three rules. DPPO was compared on Square and Transport only (appendix C.2), which the kit does not have.
+Fig. 1 gives means over three ManiSkill and three Adroit tasks (facts.md 4.1), the rules here count all eight. DPPO was compared on Square and Transport only (appendix C.2), which the kit does not have.
 """
 from __future__ import annotations
 
