@@ -126,7 +126,10 @@ def test_agent_episodes_are_what_the_simulator_did(monkeypatch):
 
     monkeypatch.setattr(sources, "get_task", lambda name: PROBES[name])
     base = ProbeBase(dict(obs_dim=4, act_dim=2, kind="reach", bias=[0.0, 0.0]))
+    started = []
+    monkeypatch.setattr(base, "reset", started.append)
     episodes = sources.agent_episodes(base, "reach", 6, 100, 0.1, 3)
+    assert started == [100]  # so that one that samples makes the same again
     assert len(episodes) == 6 and all(e["success"].any() for e in episodes)
     for e in episodes:
         assert len(e["observations"]) == len(e["actions"]) + 1

@@ -291,6 +291,31 @@ def test_unlearning_and_relearning(results):
     assert verdict_of([0.6, 0.5, 0.7, 0.6, 0.5], [0.9, 0.8, 0.9, 0.9, 0.9]) == ["not", None]
 
 
+def test_a_run_that_comes_back_in_between_was_relearned_and_one_that_falls_last_was_not_yet_tried(results):
+    claim = CLAIMS.claim[CLAIMS.claim.str.startswith("Once unlearned")].item()
+
+    def found(*successes, recipe="sac_finetune", end=0.4):
+        lines = [pd.DataFrame({"task": "Door", "recipe": recipe, "seed": seed, "step": 1_000 * np.arange(1, 5), "success_once": successes})
+                 for seed in range(5)]
+        write(results, "leaderboard", runs(recipe, [end] * 5), curves=pd.concat(lines))
+        return (one.verdict, one.measured) if (one := verdicts.find(claim)) else None
+
+    assert found(0.0, 0.3, 0.4, 0.4) == ("reproduced", "5 of 5 unlearned runs never come back to their start")
+    assert found(0.0, 0.9, 1.0, 0.4) == ("not", "0 of 5 unlearned runs never come back to their start")
+    assert found(0.9, 0.0, 0.4, 0.4, end=0.5) == ("not", "0 of 5 unlearned runs never come back to their start")
+    assert found(0.9, 0.8, 0.9, 0.0) is None and found(0.0, 0.3, 0.4, 0.4, recipe="rot") is None
+
+
+def test_a_fall_on_one_task_alone_is_no_fall_on_both(results):
+    claim = CLAIMS.claim[CLAIMS.claim.str.startswith("Fine-tuning baselines unlearn")].item()
+    cells = [(method, task) for method in ("sac_finetune", "calql") for task in ("Door", "StackCube")]
+    for door, verdict in ((0.8, "not"), (0.0, "reproduced")):  # on Door it rises by 30 points, or falls; on StackCube it falls by 70
+        table = pd.concat(runs(method, [0.0] * 3, task=task, base=0.5 if task == "Door" else 0.7) for method, task in cells)
+        lines = [curve(method, [door if task == "Door" else 0.0] * 3, [0.0] * 3).assign(task=task) for method, task in cells]
+        write(results, "leaderboard", table, curves=pd.concat(lines))
+        assert verdicts.find(claim).verdict == verdict
+
+
 def test_residual_rl_early_and_late(results):
     early, late = (CLAIMS.claim[CLAIMS.claim.str.startswith(f"Residual RL fails {when}")].item() for when in ("early", "later"))
 
@@ -313,7 +338,7 @@ def test_what_was_learned_offline_is_no_first_evaluation(results):
     assert found.verdict == "partly" and "calql -50.0" in found.measured  # the only method that is recorded
 
 
-def test_most_methods_must_fall_and_a_late_fall_counts_as_unlearned(results):
+def test_most_methods_must_fall(results):
     early, late = (CLAIMS.claim[CLAIMS.claim.str.startswith(words)].item() for words in ("Fine-tuning baselines unlearn", "Once unlearned"))
     firsts = {"sac_finetune": 0.0, "rot": 0.0, "calql": 0.5, "rlpd_paper": 0.45, "ppo_finetune": 0.0}
     for falling, verdict in ((2, "partly"), (3, "reproduced")):
@@ -323,7 +348,8 @@ def test_most_methods_must_fall_and_a_late_fall_counts_as_unlearned(results):
         write(results, "leaderboard", *tables, curves=pd.concat(lines))
         found = verdicts.find(early)
         assert found.verdict == verdict and found.measured.startswith(f"{falling} of 4 methods fall")  # fine-tuning by PPO is none of them
-        assert verdicts.find(late).measured.startswith("12 of 12 unlearned runs")
+        lost = 3 * (falling - 1)  # rot's do not count
+        assert verdicts.find(late).measured.startswith(f"{lost} of {lost} unlearned runs")
 
 
 def test_some_success_at_first_is_not_none(results):
@@ -649,6 +675,49 @@ def test_a_warm_start_is_judged_at_equal_ages_of_the_actor(results, late, verdic
     else:
         assert found.verdict == verdict
         assert f"without {50 * first:.1f} %, with a warm start and a fixed temperature {50 * late:.1f} %" in found.measured
+
+
+@pytest.mark.parametrize("stack, others, verdict", [
+    ({"runs.warm.q": 600.0}, {}, "reproduced"),
+    ({"runs.warm.q": 120.0}, {}, "partly"),  # Q does not explode on StackCube: 2.4 times what rewards can make, and 4 times vanilla's
+    ({"runs.warm.q": 600.0}, {"runs.vanilla.q": 400.0}, "partly"),  # it does without a warm start, too
+    ({"runs.warm.q": 600.0, "runs.warm.temperature": 1.5}, {"runs.warm.temperature": 1.5}, "partly"),
+    ({"runs.warm.q": 40.0, "runs.warm.temperature": 1.5}, {"runs.warm.q": 40.0, "runs.warm.temperature": 1.5}, "not")])
+def test_a_warm_start_explodes_where_q_does_on_every_task(results, stack, others, verdict):
+    claim = CLAIMS.claim[CLAIMS.claim.str.startswith("Warm-starting the critic makes")].item()
+    usual = {"runs.warm.temperature": 2.8, "runs.vanilla.temperature": 1.0, "runs.warm.q": 600.0, "runs.vanilla.q": 30.0,
+             "rewards_alone": 50.0}
+    for name, task, changed in (("warm_start", "Door", others), ("warm_start_stackcube", "StackCube", others | stack)):
+        write(results, name, pd.DataFrame({"task": task, "recipe": "x", "seed": range(3)} | usual | changed))
+    found = verdicts.find(claim)
+    assert found.verdict == verdict and found.tasks == "Door StackCube"
+
+
+@pytest.mark.parametrize("fixed, verdict", [([40.0, 50.0, 60.0], "reproduced"), ([4.0, 5.0, 6.0], "partly"), ([0.4, 0.5, 0.6], "not")])
+def test_a_critic_is_very_unstable_by_its_loss(results, fixed, verdict):
+    """Against 1 without a warm start; the largest that a run logs counts."""
+    claim = CLAIMS.claim[CLAIMS.claim.str.startswith("With a warm start and a fixed entropy coefficient, the training")].item()
+    lines = [curve(recipe, [0.0] * 3, [0.0] * 3).assign(critic_loss=lambda rows, top=top: np.where(
+        rows.step == 10_000, rows.seed.map(dict(enumerate(top))), 0.1)) for recipe, top in (("warm-fixed", fixed), ("vanilla", [1.0] * 3))]
+    write(results, "warm_finetuning", *(runs(recipe, [0.0] * 3) for recipe in ("warm-fixed", "vanilla")), curves=pd.concat(lines))
+    assert verdicts.find(claim).verdict == verdict
+
+
+def test_random_gradients_that_point_apart_on_two_tasks_are_no_noise(results):
+    claim = CLAIMS.claim[CLAIMS.claim.str.startswith("Gradients of a randomly")].item()
+    for cosine, verdict in ((0.05, "reproduced"), (0.6, "not")):
+        write(results, "unlearning", pd.DataFrame({
+            "task": ["Door"] * 3 + ["StackCube"] * 3, "seed": [0, 1, 2] * 2, "drift.random critic": 0.1,
+            "cosine_random": [cosine, cosine + 0.01, cosine - 0.01] + [-cosine] * 3}))
+        assert verdicts.find(claim).verdict == verdict
+
+
+@pytest.mark.parametrize("ends, verdict", [([0.96] * 9 + [0.9], "reproduced"), ([0.96] * 3 + [0.9], "partly"), ([0.96] + [0.9] * 2, "not")])
+def test_most_seeds_of_door_reach_nearly_all(results, ends, verdict):
+    claim = CLAIMS.claim[CLAIMS.claim.str.startswith("Policy Decorator lifts an imperfect BeT base")].item()
+    write(results, "main_job", runs("lesson", ends), runs("lesson", [1.0] * 5, task="Hammer"))
+    found = verdicts.find(claim)
+    assert found.verdict == verdict and found.tasks == "Door" and found.measured.startswith(f"{ends.count(0.96)} of {len(ends)} seeds")
 
 
 def test_a_warm_start_lasts_as_long_as_two_evaluations_are_apart():

@@ -94,6 +94,7 @@ def agent_episodes(policy, task: str, num: int, first_seed: int, noise: float, t
     The noise makes the recorded actions, which are the ones executed, vary as a demonstrator's would; episodes that the
     task's limit ends unsolved are dropped.
     """
+    policy.reset(first_seed)
     kept, finished = {}, 0
     for ended in _play(policy, get_task(task), range(first_seed, first_seed + 4 * num), min(num, 10), noise):
         for e in ended:

@@ -82,8 +82,8 @@ STACK_CUBE = TaskSpec(
     act_dim=4,
     max_episode_steps=200,
     control="pd_ee_delta_pos: displacement of the gripper in the robot's frame (1 = 10 cm) and its opening, 20 Hz",
-    success_rule="the red cube lies on the green one (2 cubes apart at most half a cube sideways, 5 mm in height), "
-    "is at rest, and the gripper has let go of it",
+    success_rule="the red cube lies on the green one (their middles at most 3.3 cm apart sideways, half a cube's diagonal and 5 mm, and in "
+    "height within 5 mm of a cube's edge), is at rest, and the gripper has let go of it",
     absolute_actions=False,
     make=StackCube,
     summary="A Panda arm must put the red cube on the green one and let go.",

@@ -1,7 +1,8 @@
 """Diffusion Policy bases: decorated (data/sweeps/diffusion_tasks.toml), or also fine-tuned by DIPO and DPPO (diffusion_finetuning.toml on
 StackCube, diffusion_door.toml).
 
-Fig. 1 gives means over three ManiSkill and three Adroit tasks (facts.md 4.1), the rules here count all eight. DPPO was compared on Square and Transport only (appendix C.2), which the kit does not have.
+Fig. 1 gives means over three ManiSkill and three Adroit tasks, it is not known which (facts.md 4.1); so "reproduced" takes all eight here.
+DPPO was compared on Square and Transport only (appendix C.2), which the kit does not have.
 """
 from __future__ import annotations
 
