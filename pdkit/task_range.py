@@ -25,7 +25,7 @@ PAPER = {  # percent, means over tasks (facts of Fig. 1): base policy, decorated
 }
 SUITES = ("maniskill", "adroit")
 # Records of methods over a Diffusion Policy, and the decorator's cell in each, chosen before it was run: on StackCube the paper's bound for
-# it over a BeT, on Door the official script's default over a Diffusion Policy (the paper's own for either are not known), on the other six
+# it over a BeT, on Door the official script's default over a Diffusion Policy (the paper's own for either are not known), on the others
 # each task's own in the lesson.
 DIFFUSION = {"diffusion_finetuning": "policy_decorator,alpha=0.03", "diffusion_door": "policy_decorator",
              "diffusion_tasks": "policy_decorator"}
