@@ -17,8 +17,8 @@ from pdkit.errors import PdkitError
 from pdkit.files import DATA
 from pdkit.imitate import ImitateConfig
 from pdkit.online import Trainer
+from pdkit.pixels import learn, sapien_eyes
 from pdkit.pixels import pictures as kept
-from pdkit.pixels import sapien_eyes
 from pdkit.pixels import sim as pixel_sim
 from pdkit.pixels.cameras import VIEWS, View, view_of
 from pdkit.pixels.encoders import Encoder, PlainConv, load_encoder, random_shift, save_encoder
@@ -348,6 +348,17 @@ def sighted():
         return policy, encoder, encoded(demos, pictures, encoder)
 
 
+def test_pictures_are_shifted_while_a_policy_learns_from_them(monkeypatch):
+    monkeypatch.setitem(pixel_sim.EYES, "probe", Painted)
+    demos, shifts = reach_demos(2), []
+    pictures = draw(demos, spec=PROBES["reach"], view=REACH)
+    config = ImitateConfig(iterations=3, batch=8, eval_episodes=0, bf16=False)
+    monkeypatch.setattr(learn, "random_shift", lambda seen, pad, generator: shifts.append(pad) or seen)
+    for shift in (0, 2):
+        imitate_pixels("mlp", demos, pictures, config, {"hidden": 16}, spec=PROBES["reach"], view=REACH, shift=shift)
+    assert shifts == [2, 2, 2]
+
+
 def test_what_imitation_leaves(sighted):
     policy, encoder, seen = sighted
     np.testing.assert_allclose(policy.normalizer.mean.numpy(), seen.observations.mean(0), atol=1e-4)  # of the features too
@@ -488,6 +499,7 @@ def test_from_the_command_line(monkeypatch, tmp_path, capsys):
     base, runs = str(tmp_path / "b"), str(tmp_path / "t")
     assert call("train", "base", "Door", "--policy", "mlp", "--pixels", "--num-demos", "1", "--out", base, "--set", "iterations=3",
                 "batch=8", "eval_episodes=0", "hidden=32", "random_shift=2") == 0
+    assert "bf16=False" in capsys.readouterr().out  # features would be rounded away
     assert call("train", "decorated", "Door", "--profile", "smoke", "--base", base, "--episodes", "1", "--out", runs, "--set",
                 "total_steps=300", "warmup_steps=120", "eval_every=0", "num_envs=1") == 0
     assert "env_steps 300" in capsys.readouterr().out

@@ -9,10 +9,12 @@ import torch
 from pdkit import train
 from pdkit.demos.format import from_episodes
 from pdkit.errors import PdkitError
-from pdkit.imitate import ImitateConfig, Windows, imitate
+from pdkit.gradient_steps import make_optimizer
+from pdkit.imitate import ImitateConfig, Windows, imitate, untrained
 from pdkit.policies import POLICIES, BeT, load_policy, save_policy
-from pdkit.policies.base import share_weights
+from pdkit.policies.base import Normalizer, share_weights
 from pdkit.policies.bet import focal_loss
+from pdkit.tasks import get_task
 
 SMALL = dict(obs_dim=3, act_dim=2, window=4, bins=3, layers=2, heads=2, embed=16, features=16)
 
@@ -76,6 +78,37 @@ def test_offsets_are_learned_at_the_true_bin_only():
     assert torch.allclose(terms["loss"], terms["focal"] + 1000 * terms["offset_mse"])
 
 
+@pytest.mark.parametrize("gamma", [2.0, 0.5])
+def test_every_position_of_a_window_is_an_example(gamma):
+    policy = bet(dropout=0.0, focal_gamma=gamma)
+    policy.centres.copy_(torch.tensor([[0.0, 0.0], [0.5, 0.5], [-0.5, 0.5]]))
+    windows, true, off = torch.randn(6, 4, 3), torch.randint(3, (6, 4)), 0.1 * torch.rand(6, 4, 2)
+    terms = policy.loss(windows, policy.centres[true] + off)
+    with torch.no_grad():
+        out = policy.head(policy.gpt(policy.normalizer(windows)))
+    offsets = out[..., 3:].unflatten(-1, (3, 2)).gather(2, true[..., None, None].expand(6, 4, 1, 2))[:, :, 0]
+    assert torch.allclose(terms["focal"], focal_loss(out[..., :3].flatten(0, 1), true.flatten(), gamma), atol=1e-6)
+    assert torch.allclose(terms["offset_mse"], ((offsets - off) ** 2).mean(), atol=1e-6)
+
+
+def test_a_dimension_that_never_varies_is_passed_through_however_many_rows_there_are():
+    normalizer = Normalizer(3)
+    observations = np.tile(np.float32([-0.615, 1.7, 0.0]), (40_000, 1))
+    observations[::2, 2] = 2.0
+    normalizer.fit(observations)
+    assert normalizer.std.tolist() == [1.0, 1.0, 1.0] and torch.allclose(normalizer.mean, torch.tensor([-0.615, 1.7, 1.0]))
+
+
+def test_bet_decays_the_weights_that_the_papers_code_does():
+    policy = bet()
+    groups = make_optimizer(policy, ImitateConfig(weight_decay=0.3, beta1=0.8)).param_groups
+    decay = {id(p): group["weight_decay"] for group in groups for p in group["params"]}
+    expected = {name: 0.01 if name.startswith("head") else 0.3 if p.dim() == 2 and name != "gpt.position" else 0.0
+                for name, p in policy.named_parameters()}
+    assert {name: decay[id(p)] for name, p in policy.named_parameters()} == expected
+    assert set(expected.values()) == {0.01, 0.3, 0.0} and all(group["betas"] == (0.8, 0.999) for group in groups)
+
+
 def test_acting_takes_the_likeliest_bin_and_its_offset_at_the_last_position():
     policy = bet(dropout=0.0).eval()
     policy.centres.copy_(torch.tensor([[0.0, 0.0], [0.5, 0.5], [-0.5, 0.5]]))
@@ -97,13 +130,13 @@ def test_dropout_stays_on_only_when_asked():
         assert np.array_equal(policy.act(x), first)
 
 
-def line_demos(num=6, length=12):
-    """On Door's shapes: the action's first entry is the sign of the first observation, the second half its size."""
+def line_demos(num=6, length=12, before=0):
+    """On Door's shapes: the action's first entry is the sign of the first observation (so many steps `before`), the others are 0."""
     rng, episodes = np.random.default_rng(0), []
     for _ in range(num):
         observations = rng.normal(size=(length + 1, 39))
         actions = np.zeros((length, 28))
-        actions[:, 0] = 0.7 * np.sign(observations[:-1, 0])
+        actions[before:, 0] = 0.7 * np.sign(observations[:length - before, 0])
         episodes.append(dict(observations=observations, actions=actions, success=np.zeros(length, bool)))
     return from_episodes("Door", episodes, label="scripted", how="test", command="pytest")
 
@@ -132,6 +165,29 @@ def test_imitation_learns(kind, config, lr):
     predicted = policy.act(observations.numpy())[:, 0, 0]
     assert (np.sign(predicted) == np.sign(actions[:, -1, 0].numpy())).mean() > 0.95
     assert len(history) == 1 and history[0]["loss"] < 5
+
+
+@pytest.mark.parametrize("kind", ["rnn", "cnn"])
+def test_a_policy_with_memory_tells_what_it_saw_before(kind):
+    """And each episode for itself: what others see at the same time changes nothing."""
+    demos = line_demos(20, 20, before=1)
+    settings = ImitateConfig(iterations=600, batch=64, lr=3e-3, eval_episodes=0, eval_every=600, bf16=False)
+    policy, _ = imitate(kind, demos, settings, dict(window=4, hidden=64, layers=2 if kind == "cnn" else 1))
+    observations, actions = Windows(demos, policy.window, False).sample(200, torch.Generator().manual_seed(1))
+    predicted = policy.act(observations.numpy())
+    assert (np.sign(predicted[:, 0, 0]) == np.sign(actions[:, -1, 0].numpy())).mean() > 0.9
+    np.testing.assert_allclose(policy.act(observations[:1].numpy()), predicted[:1], atol=1e-5)
+
+
+def test_a_learning_rate_that_rises_from_0_moves_nothing_at_the_first_step():
+    moved = []
+    for warm in (0, 1):
+        settings = ImitateConfig(iterations=1, batch=16, eval_episodes=0, eval_every=1, bf16=False, lr_warmup=warm)
+        policy, _ = imitate("mlp", line_demos(), settings, dict(hidden=8))
+        torch.manual_seed(0)
+        fresh = untrained("mlp", get_task("Door"), dict(hidden=8))
+        moved.append(any(not torch.equal(p, q) for p, q in zip(policy.parameters(), fresh.parameters(), strict=True)))
+    assert moved == [True, False]
 
 
 BAD = [  # policy, setting as typed, what the sentence must name

@@ -34,8 +34,8 @@ class Normalizer(nn.Module):
         No deviation is taken to be below `floor`: joints that the demonstrations hardly move would otherwise be what a policy sees
         best, and lead it astray as soon as they move a little more.
         """
-        std = observations.std(axis=0)
-        self.mean.copy_(torch.from_numpy(observations.mean(axis=0)))
+        mean, std = (of(observations, axis=0, dtype=np.float64) for of in (np.mean, np.std))  # sums in float32 would make constants vary
+        self.mean.copy_(torch.from_numpy(mean))
         self.std.copy_(torch.from_numpy(np.where(std < 1e-4, 1.0, np.maximum(std, floor))))
 
     def forward(self, observations: torch.Tensor) -> torch.Tensor:
