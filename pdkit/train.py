@@ -105,7 +105,6 @@ def _base(args) -> int:
     shift, eyes = (settings.pop(name, None) if args.pixels else None for name in ("random_shift", "encoder"))
     if args.pixels:
         check_pixels(args.policy, shift, eyes)
-        settings = {"bf16": False} | settings  # see imitate_pixels
     encoder = encoder_of(str(eyes)) if eyes is not None else None
     if eyes is not None and not encoder:
         raise PdkitError(f"There is no encoder in {eyes}; name the folder of a policy trained by `pdkit train base {args.task} --pixels`.")
