@@ -113,9 +113,9 @@ def _() -> Finding:
                   for column in ("decorated_success", "base_success"))
     reached = int((end >= NEARLY).sum())
     share, level = wilson(reached, len(end)), mean_interval(end)
-    return finding("main_job", end, f"{reached} of {len(end)} seeds reach {percent(NEARLY)} (base {percent(average(start))}); mean "
-                   f"{percent(level.value)}", f"share of seeds {percent(share.low)} to {percent(share.high)} (Wilson, 95 %); mean "
-                   f"{percent(level.low)} to {percent(min(level.high, 1.0))} ({METHOD})",
+    return finding("main_job", end, f"{reached} of {len(end)} seeds reach {100 * NEARLY:.0f} % (base {percent(average(start))}); mean "
+                   f"{percent(level.value)}", f"share of seeds {100 * share.low:.0f} to {100 * share.high:.0f} % (Wilson, 95 %); mean "
+                   f"{100 * level.low:.1f} to {100 * min(level.high, 1.0):.1f} % ({METHOD})",
                    "reproduced" if share.low > 0.5 else "partly" if share.value > 0.5 else "not")
 
 
