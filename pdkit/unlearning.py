@@ -20,6 +20,7 @@ import numpy as np
 import torch
 from torch import nn
 
+from .claims import EXPLODES, RISES
 from .decorated import Decorated
 from .decorator import compose, gate
 from .demos import Demos
@@ -234,8 +235,8 @@ def warm_start_verdict(runs: dict[str, dict[str, float]], bound: float) -> tuple
     than twice what it is without a warm start).
     """
     warm, vanilla, fixed = (runs[name] for name in ("warm", "vanilla", "fixed"))
-    rises = warm["temperature"] > 2 * max(1.0, vanilla["temperature"])
-    explodes = warm["q"] > max(10 * bound, 2 * vanilla["q"])
+    rises = warm["temperature"] > RISES * max(1.0, vanilla["temperature"])
+    explodes = warm["q"] > max(EXPLODES * bound, RISES * vanilla["q"])
     return ("reproduced" if rises and explodes else "partly" if rises or explodes else "not"), [
         f"temperature: times {warm['temperature']:.2f} with a warm start, times {vanilla['temperature']:.2f} without: "
         f"{'the warm start lets it rise' if rises else 'no rise that only the warm start explains'}",

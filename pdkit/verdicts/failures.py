@@ -9,7 +9,9 @@ import numpy as np
 import pandas as pd
 
 from ..claims import (
+    EXPLODES,
     METHOD,
+    RISES,
     Finding,
     TooLittle,
     average,
@@ -242,7 +244,8 @@ def _() -> Finding:
                    f"{2 ** third.value:.1f} times what rewards alone can make{task_by_task(worth, lambda ratio: f'{2 ** ratio:.1f}')}",
                    f"{2 ** first.low:.2f} to {2 ** first.high:.2f}, {2 ** second.low:.1f} to {2 ** second.high:.1f} and "
                    f"{2 ** third.low:.1f} to {2 ** third.high:.1f} times ({METHOD})",
-                   jointly(judged_over_tasks(rises, 1.0), weakest(judged_over_tasks(q, 1.0), judged_over_tasks(worth, float(np.log2(10))))))
+                   jointly(judged_over_tasks(rises, np.log2(RISES)),
+                           weakest(judged_over_tasks(q, np.log2(RISES)), judged_over_tasks(worth, np.log2(EXPLODES)))))
 
 
 WARM_UPDATES = 625  # of data/sweeps/warm_finetuning.toml: the distance of two evaluations, so that both arms meet at equal ages

@@ -263,9 +263,9 @@ def _() -> Finding:
         with contextlib.suppress(TooLittle):
             start, ends = (by_seed(table, recipe, column) for column in ("base_success", "decorated_success"))
             for run, rows in evaluations(curves, recipe).groupby(["task", "seed"]):
-                if run in start.index and (best := best_after_loss(rows.success_once.to_numpy(), start[run])) is not None:
+                if run in start.index and (later := best_after_loss(rows.success_once.to_numpy(), start[run])) is not None:
                     lost.append(run)
-                    back += max(best, ends[run]) >= start[run]
+                    back += max(later, ends[run]) >= start[run]
     if len(lost) < LEAST_SEEDS:
         raise TooLittle("Fewer than three runs had unlearned.")
     rate = wilson(len(lost) - back, len(lost))
