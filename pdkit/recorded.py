@@ -26,7 +26,7 @@ OWN = ",partnet"  # behind the recipe of a row on the user's own objects
 
 
 def record(name: str, rows: pd.DataFrame, curves: pd.DataFrame) -> None:
-    """Add rows to data/results/NAME.csv and, where there are curves, NAME_curves.csv, and draw NAME.png of trainings anew.
+    """Add rows to data/results/NAME.csv and, where there are curves, NAME_curves.csv, and draw a picture a task of trainings.
 
     The manifest tells how to make all of it again (the column `sweep` of rows that have one, else `command`) and which machines have
     recorded here, this one last; a row's `cores` hint at which of them made it. On the user's own objects (PDKIT_PARTNET) a recipe is
@@ -47,8 +47,15 @@ def record(name: str, rows: pd.DataFrame, curves: pd.DataFrame) -> None:
         write_json(path, {"written": time.strftime("%Y-%m-%d"), "machines": _machines(path), "again": sorted(set(again))})
         if len(tables) < 2 or not {"base_success", "decorated_success"} <= set(tables[0]):
             return
-        with atomic_file(folder / f"{name}.png") as temporary:
-            save_small(figure(*tables, "Door" if "Door" in set(tables[0].task) else str(rows.task.iloc[0])), temporary)
+        for task in dict.fromkeys(tables[0].task):  # all: which is the first may have changed
+            with atomic_file(folder / f"{picture_of(name, task, tables[0])}.png") as temporary:
+                save_small(figure(*tables, task), temporary)
+
+
+def picture_of(name: str, task: str, table: pd.DataFrame) -> str:
+    """What the picture of a task is called: NAME of Door, or of the first task where Door is none of them, NAME_TASK of the others."""
+    first = "Door" if "Door" in set(table.task) else table.task.iloc[0]
+    return name if task == first else f"{name}_{task.lower()}"
 
 
 def _on_own_objects(table: pd.DataFrame) -> pd.Series:

@@ -28,7 +28,7 @@ from .cli import Parser
 from .errors import PdkitError
 from .files import DATA, atomic_file, runs_root
 from .plots import Picture, save_small
-from .recorded import KEYS, of_these_objects
+from .recorded import KEYS, of_these_objects, picture_of
 
 COLUMNS = ["claim", "section", "tasks", "seeds", "measured", "interval", "verdict", "command"]
 VERDICTS = {"reproduced": "what the paper says was found", "partly": "found in part, or not yet with certainty",
@@ -136,8 +136,9 @@ def sections(claims: pd.DataFrame, tables: dict[str, pd.DataFrame], folder: Path
         rows = table.drop(columns=["command", "sweep"], errors="ignore").to_dict("records")
         shown = [page.details(f"{len(table)} rows", page.table(rows)),
                  page.details("How to make them again", page.code("\n".join(again)))]
-        picture = folder / f"{name}.png"
-        parts.append(page.Section(f"Recorded: {name}", ([page.figure(picture, f"{name}.csv")] if picture.exists() else []) + shown))
+        pictures = [(folder / f"{picture_of(name, task, table)}.png", task) for task in dict.fromkeys(table.task)]
+        drawn = [page.figure(path, f"{name}.csv, {task}") for path, task in pictures if path.exists()]
+        parts.append(page.Section(f"Recorded: {name}", drawn + shown))
     return parts
 
 

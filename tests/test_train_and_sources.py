@@ -10,7 +10,7 @@ from worlds import reach_demos
 
 import pdkit.demos.sources as sources
 import pdkit.recorded as recorded
-from pdkit import cli, train
+from pdkit import cli, report, train
 from pdkit.decorated import load_decorated
 from pdkit.demos import load_demos, save_demos
 from pdkit.errors import PdkitError
@@ -168,6 +168,12 @@ def test_a_record_of_another_task_alone_can_be_drawn(monkeypatch, tmp_path):
     curve = dict(task="StackCube", recipe="lesson", seed=0, step=[10, 20], success_once=[0.5, 0.9])
     recorded.record("s", pd.DataFrame([row]), pd.DataFrame(curve))
     assert (tmp_path / "results" / "s.png").stat().st_size > 1000
+    for task, names in (("Pen", ("s", "s_stackcube")), ("Door", ("s", "s_pen", "s_stackcube"))):  # each task has its own, Door the first
+        recorded.record("s", pd.DataFrame([row | {"task": task}]), pd.DataFrame(curve | {"task": task}))
+        assert sorted(path.stem for path in (tmp_path / "results").glob("*.png")) == sorted(names)
+    shown = [part for part in report.sections(pd.DataFrame(columns=["verdict", "claim", "section", "tasks"]),
+                                              {"s": recorded.load("s")[0]}, tmp_path / "results") if part.title == "Recorded: s"]
+    assert [str(shown).count(f"<figcaption>s.csv, {task}<") for task in ("Door", "Pen", "StackCube")] == [1, 1, 1]
 
 
 def test_tensorboard_gets_every_number_at_its_step(tmp_path):
