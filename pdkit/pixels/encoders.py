@@ -5,6 +5,11 @@
     128 x 128   one stage more than for 64 x 64: 16, 16, 32, 64, 128. The paper's encoder for Adroit is not known; this is ours
     then        a 1 x 1 convolution to 128 channels (for 50 x 125 the one above), and a linear layer with a ReLU to 256 features
 
+It starts without biases, as ManiSkill's PlainConv does (haosulab/ManiSkill, examples/baselines/diffusion_policy; the file that the
+paper's code imports is not in its repository), and with He's weights (He et al. 2015), which is ours: each layer keeps the spread of
+what it is given. PyTorch's own weights and biases make features of a picture that vary by a ten-thousandth around constants, and a policy
+that imitates for a thousand gradient steps with them learns everything but to look (data/RESULTS.md, "Pixels").
+
 Colours come in as bytes, distances in 1/1024 metre; the network sees both divided by their units.
 """
 from __future__ import annotations
@@ -42,6 +47,10 @@ class PlainConv(nn.Module):
             channels, height, width = width_out, height // 2, width // 2
         self.conv = nn.Sequential(*layers, nn.Conv2d(channels, 128, 1), nn.ReLU(), nn.Flatten())
         self.fc = nn.Linear(128 * height * width, FEATURES)
+        for layer in (*self.conv, self.fc):
+            if isinstance(layer, nn.Conv2d | nn.Linear):
+                nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")
+                nn.init.zeros_(layer.bias)
         self.to(memory_format=torch.channels_last)  # convolutions take half the time so on a CPU
 
     def forward(self, pictures: torch.Tensor) -> torch.Tensor:
