@@ -17,6 +17,7 @@ import torch
 from .errors import PdkitError, unknown
 
 CRITIC_INPUTS = ("sum", "concat", "residual")  # appendix E.2
+RESIDUAL_UNITS = ("action", "bound")
 ACTOR_INPUTS = ("obs", "obs+base")  # appendix E.1
 
 
@@ -27,7 +28,8 @@ class DecoratorConfig:
     alpha: float = 0.1  # bound of the residual per action dimension; the official commands' are 0.03 to 0.3
     alpha_scale: tuple[float, ...] = ()  # factors on alpha, one an action dimension (a gripper's, say); empty: all 1
     H: int = 30_000  # primitive steps over which the gate opens; 0 means always open
-    critic_input: str = "sum"  # sum: a_base + alpha * a_res; concat: both; residual: alpha * a_res alone
+    critic_input: str = "sum"  # sum: a_base + alpha * a_res; concat: a_base and the residual; residual: the residual alone
+    residual_units: str = "action"  # of a residual that critics see by itself. action: alpha * a_res; bound: a_res, as in the official code
     actor_input: str = "obs"  # obs: the current observation; obs+base: with the base action
 
     def __post_init__(self):
@@ -39,6 +41,8 @@ class DecoratorConfig:
             raise PdkitError(f"H counts environment steps and must be 0 or more, not {self.H}.")
         if self.critic_input not in CRITIC_INPUTS:
             raise unknown("critic_input", self.critic_input, CRITIC_INPUTS)
+        if self.residual_units not in RESIDUAL_UNITS:
+            raise unknown("residual_units", self.residual_units, RESIDUAL_UNITS)
         if self.actor_input not in ACTOR_INPUTS:
             raise unknown("actor_input", self.actor_input, ACTOR_INPUTS)
 
@@ -75,17 +79,24 @@ def _factors(config: DecoratorConfig, device: torch.device | None, dtype):
 
 
 def compose(config: DecoratorConfig, base, residual):
-    """The executed action, before the environment clips it. The critic sees this unclipped sum too."""
+    """The executed action, before the environment clips it. The critic sees this unclipped sum too.
+
+    The base action is within [-1, 1] (`Policy.act` clips it, the official code does not), so that a residual that points inwards is felt
+    where the base policy asks for more than the most.
+    """
     return base + scaled(config, residual)
 
 
 def critic_features(config: DecoratorConfig, obs: torch.Tensor, base: torch.Tensor, residual: torch.Tensor) -> torch.Tensor:
-    """What the critic sees, (B, critic_dim)."""
+    """What the critic sees, (B, critic_dim).
+
+    A residual in units of its bound is what the official code shows beside the base action, or alone. In units of actions it is alpha times
+    smaller, and so is its weight in a new critic; but a demonstrated action may lie many bounds away from the base policy's.
+    """
     if config.critic_input == "sum":
         return torch.cat([obs, compose(config, base, residual)], dim=-1)
-    if config.critic_input == "concat":
-        return torch.cat([obs, base, scaled(config, residual)], dim=-1)
-    return torch.cat([obs, scaled(config, residual)], dim=-1)
+    seen = residual if config.residual_units == "bound" else scaled(config, residual)
+    return torch.cat([obs, base, seen] if config.critic_input == "concat" else [obs, seen], dim=-1)
 
 
 def actor_features(config: DecoratorConfig, obs: torch.Tensor, base: torch.Tensor) -> torch.Tensor:

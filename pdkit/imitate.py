@@ -138,6 +138,8 @@ class Average:
         if power:
             from diffusers.training_utils import EMAModel  # takes seconds to load
 
+            # The official code gives the power without the warm-up, and diffusers then does not look at it: its average remembers less
+            # below 6,600 steps (112 instead of 178 at 1,000) and more up to about 215,000. This is the original Diffusion Policy's.
             # On a GPU all weights at once, or the average would take longer than the step; on a CPU that would only round differently.
             self._ema = EMAModel(self._parameters, use_ema_warmup=True, power=power, foreach=self._parameters[0].is_cuda)
 

@@ -24,7 +24,7 @@ _PAPER: dict[str, Any] = dict(
     total_steps=3_000_000, num_envs=16, warmup_steps=8_000, warmup="uniform", utd=0.25, batch=1024, demo_fraction=0.0, n_step=1,
     gamma=0.97, reward_shift=-1.0, on_success="terminate", bootstrap="truncated", normalize_obs=False, lr_decay_from=1.0,
     eval_every=50_000, eval_episodes=50, select="last", log_every=10_000, checkpoint_every=50_000, alpha=0.2, H=2_000_000,
-    train_limit=0, success_tail=0, layers=3, actor_every=1, residual_penalty=0.0,
+    residual_units="bound", train_limit=0, success_tail=0, layers=3, actor_every=1, residual_penalty=0.0,
     actor_lr=1e-4, critic_lr=1e-4, critic_layer_norm=False, log_std_range=(-20.0, 2.0), init_temperature=1.0, average=0.0, bf16=False,
 )
 # Per task: alpha, H, step budget and learning rates of the official commands (facts.md 1.4). For the Adroit tasks the paper's
@@ -91,9 +91,13 @@ def profile_values(task: str, profile: str) -> dict[str, Any]:
     get_task(task)
     if profile not in PROFILES:
         raise unknown("profile", profile, PROFILES)
-    like = next((spec.name for spec in TASKS.values() if spec.demo_task == task), task)  # a task of other objects: as with those
-    lesson = _LESSON | _LESSON_TASK.get(like, {})
-    return {"paper": _PAPER | _PAPER_TASK.get(like, {}), "lesson": lesson, "smoke": lesson | _SMOKE}[profile]
+    lesson = _LESSON | _LESSON_TASK.get(_like(task), {})
+    return {"paper": _PAPER | _PAPER_TASK.get(_like(task), {}), "lesson": lesson, "smoke": lesson | _SMOKE}[profile]
+
+
+def _like(task: str) -> str:
+    """The task whose values are a task's: of one with the objects of the demonstrations, the task that is learned from them."""
+    return next((spec.name for spec in TASKS.values() if spec.demo_task == task), task)
 
 
 def policy_values(task: str, profile: str, kind: str, chunk: int) -> dict[str, Any]:
@@ -103,7 +107,7 @@ def policy_values(task: str, profile: str, kind: str, chunk: int) -> dict[str, A
     task's own; the paper's budgets over a Diffusion Policy are chunks, ours primitive steps.
     """
     if profile == "paper" and kind == "diffusion":
-        values = _PAPER_DIFFUSION | _PAPER_DIFFUSION_TASK.get(task, {})
+        values = _PAPER_DIFFUSION | _PAPER_DIFFUSION_TASK.get(_like(task), {})
         steps = {name: values[name] * chunk for name in ("total_steps", "warmup_steps", "H", "eval_every")}
         return values | steps | {"utd": values["utd"] / chunk}
     if chunk == 1 or profile == "paper":

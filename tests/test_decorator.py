@@ -1,4 +1,6 @@
 """The decorator, line by line (facts.md 1.1)."""
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -36,6 +38,8 @@ def test_critic_inputs(kind, expected):
     features = critic_features(config, OBS, BASE, RESIDUAL)
     assert torch.allclose(features, torch.tensor([expected], dtype=torch.float32))
     assert features.shape[1] == config.critic_dim(3, 2)
+    official = critic_features(replace(config, residual_units="bound"), OBS, BASE, RESIDUAL)  # what stands by itself is not scaled
+    assert torch.allclose(official, features if kind == "sum" else torch.cat([features[:, :-2], RESIDUAL], dim=1))
 
 
 @pytest.mark.parametrize(("kind", "expected"), [("obs", [1, 2, 3]), ("obs+base", [1, 2, 3, 0.5, -0.5])])
@@ -66,7 +70,7 @@ def test_gate_is_drawn_per_environment_and_decision_and_stores_exact_zeros():
 
 
 @pytest.mark.parametrize("bad", [dict(alpha=0.0), dict(alpha=1.5), dict(alpha=-0.1), dict(H=-1), dict(critic_input="both"),
-                                 dict(alpha_scale=(-1.0,)), dict(actor_input="x")])
+                                 dict(alpha_scale=(-1.0,)), dict(actor_input="x"), dict(residual_units="m")])
 def test_bad_values_are_told_in_one_sentence(bad):
     with pytest.raises(PdkitError) as error:
         DecoratorConfig(**bad)

@@ -363,6 +363,7 @@ def test_the_paper_profile_is_the_official_recipe():
 def test_a_task_of_other_objects_has_the_values_of_its_twin(task, profile):
     novel, source = (dataclasses.asdict(online_config(name, profile)) for name in (task, f"{task}Source"))
     assert novel.pop("task") != source.pop("task") and novel == source and novel["decorator"]["alpha"] != DecoratorConfig().alpha
+    assert policy_values(task, profile, "diffusion", 4) == policy_values(f"{task}Source", profile, "diffusion", 4)
 
 
 def test_decorated_policy_survives_the_disk(tmp_path):

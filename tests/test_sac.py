@@ -229,6 +229,8 @@ def test_xavier_starts_every_layer_of_its_own_networks_anew():
     for of in (lambda agent: agent.actor.head.weight, lambda agent: agent.critics.members[0][-1].weight):
         assert of(usual).abs().max() < 0.02 < 0.1 < of(xavier).abs().max() <= math.sqrt(6 / 17) + 1e-6
     assert all(torch.equal(p, q) for p, q in zip(xavier.critics.parameters(), xavier.targets.parameters(), strict=True))
+    biases = [layer.bias for part in (xavier.actor, xavier.critics) for layer in part.modules() if isinstance(layer, torch.nn.Linear)]
+    assert len(biases) > 4 and not any(bias.any() for bias in biases)
     given = Actor(3, 2, 16, 2, False, (-5.0, 2.0))
     before = given.head.weight.clone()
     SAC(3, 2, SACConfig(xavier_init=True), DecoratorConfig(), actor=given)

@@ -17,9 +17,10 @@ def mlp(sizes: list[int], layer_norm: bool) -> nn.Sequential:
 
 
 def xavier_uniform(module: nn.Module) -> None:
-    """Start a linear layer's weights anew, as facts.md 1.3 tells of PushChair; for `Module.apply`."""
+    """Start a linear layer anew, without bias, as the official code does on PushChair (facts.md 1.3); for `Module.apply`."""
     if isinstance(module, nn.Linear):
         nn.init.xavier_uniform_(module.weight)
+        nn.init.zeros_(module.bias)
 
 
 class Actor(nn.Module):
