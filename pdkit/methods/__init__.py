@@ -51,7 +51,9 @@ _ON_POLICY_PAPER = dict(ppo_rollout=128, normalize_obs=True)
 # Cal-QL: the actor acts from the first step, success ends an episode. The paper gives no number for it: the original's.
 _CALQL = _OWN_POLICY | dict(warmup="policy", on_success="terminate")
 _CALQL_PAPER: dict[str, Any] = dict(calql_offline_updates=20_000, calql_actions=10)
-_CALQL_ORIGINAL = _CALQL_PAPER | dict(utd=1.0, batch=256, gamma=0.99, actor_lr=1e-4, critic_lr=3e-4, tau=0.005, hidden=512)
+_CALQL_ORIGINAL = _CALQL_PAPER | dict(utd=1.0, batch=256, gamma=0.99, actor_lr=1e-4, critic_lr=3e-4, tau=0.005, hidden=512,
+                                      log_std_range=(-4.0, 2.0),  # a spread of 0.37 at first
+                                      init_temperature=0.1)  # there 1, with rewards that are ten times as large
 
 METHODS: dict[str, Method] = {
     "policy_decorator": Method("Policy Decorator", "facts.md 1"),
@@ -77,7 +79,7 @@ METHODS: dict[str, Method] = {
         # An update of ten critics costs four times one of two, so UTD 20 at full batch would take hours: 1 is ten times too low.
         lesson=dict(utd=1.0),
         paper=dict(utd=20.0, batch=256, gamma=0.99, actor_lr=3e-4, critic_lr=3e-4, tau=0.005, warmup_steps=5_000, total_steps=1_000_000,
-                   actor_every=20, on_success="continue"),
+                   actor_every=20, on_success="continue", log_std_range=(-3.0, 2.0), xavier_init=True),  # a spread of 0.6 at first, there 1
         trainer="pdkit.methods.scratch:Scratch"),
     "ppo_decorator": Method(
         "Policy Decorator (PPO)", "appendix D.3; facts.md 4.2: PPO instead of SAC; no numbers given, ours follow cleanrl",

@@ -9,16 +9,18 @@ goes from the original (A) to the paper's baseline (E); each is one entry of MET
     calql_d   GPT from random weights, demonstrations, online SAC
     calql     the imitated transformer, demonstrations, online SAC       (E)
 
-Online Cal-QL draws half of each batch from the offline data (the original's mixing ratio); online SAC draws none, because appendix
-B.5 says that the rest follows SAC. In E all weights learn offline; online it is the imitated policy again, with adapters, beside
-the critics learned offline. Rollouts are those of the base policy, failures kept; how many is ours (the paper gives no number),
-and so are fewer offline updates (3,000 instead of 20,000) and sampled actions (4 instead of 10 of each kind) in the lesson profile.
-Paper profile of A to C: batches of 256, rates 1e-4 and 3e-4, tau 0.005, gamma 0.99, an update a step, networks of width 512. Success
-ends an episode, as in the original, so that a return is what the critics are asked for. Rows enter the replay when their episode is
-over: only then is its return known.
+Online Cal-QL draws half of each batch from the offline data (the original's mixing ratio); online SAC draws none, because appendix B.5
+says that the rest follows SAC. Its target is SAC's as well, one action and its entropy; the switch in the original's code drops the
+conservative term alone, and keeps the largest value of several actions, without entropy. In E all weights learn offline; online it is the
+imitated policy again, with adapters, beside the critics learned offline. Rollouts are those of the base policy, failures kept; how many
+is ours (the paper gives no number), and so are fewer offline updates (3,000 instead of 20,000) and sampled actions (4 instead of 10 of
+each kind) in the lesson profile. Paper profile of A to C: batches of 256, rates 1e-4 and 3e-4, tau 0.005, gamma 0.99, an update a step,
+networks of width 512. Success ends an episode, as in the original, so that a return is what the critics are asked for. Rows enter the
+replay when their episode is over: only then is its return known.
 
-Not as in the original: demonstrations are cut at their first success (there: the last), unsolved ones are kept as failures, and both
-networks have the same size.
+Not as in the original: demonstrations are cut at their first success (there: the last), unsolved ones are kept as failures (its code
+drops offline trajectories without a reward, of experts and of the cloned policy alike; F.3 counts on them), and both networks have the
+same size.
 """
 from __future__ import annotations
 

@@ -7,7 +7,10 @@
 
 The original repeats a_vinn and the residual 50 to 100 times so that they weigh as much as image features; low-dimensional observations
 need no such thing. Its Q-filter compares a_res with itself at the same observation, which without images is always a tie (weight 0);
-here it compares a_res with 0, as its words say. Actor and critics see the last observation, not the features of the lookup.
+here it compares a_res with 0, as its words say. Actor and critics see the last observation, not the features of the lookup. The original's
+critics learn from 0.2 a_res and are asked about a_res; ours see 0.2 a_res each time. At an expert's observation its base action is
+the expert's own, ours VINN's. And it explores with small noise from the first episode on, where the loop here begins, as for the
+decorator, with uniform residuals (the lesson: 6,000 steps), of which VINN's successes suffer.
 
 The paper looks up by features of BeT's GPT (appendix B.5). The VINN that comes with the kit, on Door, and from which the recorded runs
 start, looks up by raw observations, where it does no worse (data/results/vinn.csv); another is given with --base.

@@ -11,6 +11,8 @@ defaults of cleanrl's ppo_continuous_action.py (clip 0.2, lambda 0.95, 2,048 dec
     advantages    are normalised over the open decisions of a rollout, not of a minibatch, which may hold hardly any
     gamma         is the task profile's, as in the other methods
     learning rate falls to a tenth, not to 0
+    weights       start as PyTorch's layers do and the last ones near 0 (there: orthogonal, the value's with gain 1)
+    time limits   keep the value of what would follow (there they count as an end)
 
 On-policy there is no replay, no warm-up and no demonstration in a batch. The loop learns while the simulators run: the decision in
 flight during an update is the first of the next rollout. Its ratio is to the policy that took it, whose log pi was kept; values

@@ -8,8 +8,8 @@
 
 The term pushes down what actions outside the data promise; V, the Monte-Carlo return of the data at s, stops that for the policy's
 actions (without the max it is CQL, whose values fall far below any real return and are unlearned online). Random actions are not
-bounded. c stands for the scale of the rewards: the original has -5 and 5, the loop here -1 and 0, and with c = 10 this is,
-up to a factor that Adam ignores, the original loss for rewards ten times as large.
+bounded. c stands for the scale of the rewards: with c = 10 this is, up to a factor that Adam ignores, the loss for rewards of -10 and
+0 in place of the loop's -1 and 0. The original has -5 and, once, 5: as far apart, but a step's delay costs half as much.
 """
 from __future__ import annotations
 

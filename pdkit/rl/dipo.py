@@ -9,6 +9,9 @@ Two replays: the critics learn from what was executed and what came of it, the a
 moved further each time they are drawn and so drift from the executed ones. The gradient of a batch is clipped, as a whole, to a norm
 of 0.1 for each number of an action. There is no entropy term. The target policy follows the actor as the target critics follow the critics.
 
+Moved actions are put back, as DPPO's port does it (with 10 steps of 1e-4, so by next to nothing) and the original's code says: there
+numpy copies them into a temporary array, so that every draw starts from the executed action again and moves it by 0.6 at most.
+
 Diffusion Policy predicts a sequence of `horizon` actions, of which the chunk that begins at the latest observation is executed and
 valued: that part alone is moved (appendix B.4.2: moving the rest would make it disagree with the dynamics), and the actor imitates
 the whole sequence with that part replaced.
