@@ -36,7 +36,6 @@ def imitate_pixels(kind: str, demos: Demos, pictures: Pictures, config: ImitateC
                    spec: TaskSpec | None = None, view: View | None = None) -> tuple[Policy, Encoder, list[dict]]:
     """Train an encoder and a policy of `kind` on demonstrations and their pictures.
 
-    With `config.bf16` training does not see most of what a picture changes in the features (data/RESULTS.md, "Pixels").
     `shift` is the random shift in pixels (the view's, if not given); `spec` and `view` are for worlds outside the registry.
     Returns the selected policy and encoder, on the CPU, in evaluation mode and with weights rounded to bfloat16 (as they are shipped),
     and one row a checkpoint as `imitate` does. Raises PdkitError for a kind of policy that is not one of HEADS, or a loss that is no
