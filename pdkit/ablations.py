@@ -65,11 +65,12 @@ def cell_name(alpha: float, H: int) -> str:
     return f"alpha={float(alpha)},H={H}"
 
 
-def cell_of(alpha: float, H: int, total_steps: int, critic_input: str = "sum", actor_input: str = "obs") -> str:
+def cell_of(alpha: float, H: int, total_steps: int, critic_input: str = "sum", actor_input: str = "obs", units: str = "action") -> str:
     """The recorded recipe that a run of another length corresponds to: H counts as a share of the steps, and inputs are named where
     they differ from the lesson's (alone, where alpha and H do not)."""
     cell = cell_name(alpha, round(RECORDED_STEPS * H / total_steps))
-    usual = (("critic_input", critic_input, "sum"), ("actor_input", actor_input, "obs"))
+    usual = (("critic_input", critic_input, "sum"), ("residual_units", "action" if critic_input == "sum" else units, "action"),
+             ("actor_input", actor_input, "obs"))
     inputs = [f"{name}={value}" for name, value, lesson in usual if value != lesson]
     return ",".join(inputs if inputs and cell == GRID else [cell, *inputs])
 

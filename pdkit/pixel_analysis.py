@@ -101,8 +101,9 @@ def shifted(picture: np.ndarray, down: int, right: int) -> np.ndarray:
 
 def errors(policy: Policy, encoder: Encoder, demos: Demos, pictures: Pictures) -> dict[str, float]:
     """Root mean square of what the policy does beside what the demonstrations did, in units of actions, when each frame is seen with its
-    own picture, with the one that the next demonstration showed at the same step, and with a black one. The robot's state is the right
-    one each time, so the differences are what the picture is worth.
+    own picture, with the one that the next demonstration showed at the same step, with the features of the average frame, and with a
+    black one. The robot's state is the right one each time, so the differences are what the picture is worth; a black one is like
+    nothing that the policy ever saw.
     """
     starts = np.concatenate([[0], np.cumsum(demos.lengths + 1)])
     rows = np.concatenate([start + np.arange(length) for start, length in zip(starts, demos.lengths, strict=False)])
@@ -111,7 +112,8 @@ def errors(policy: Policy, encoder: Encoder, demos: Demos, pictures: Pictures) -
     features, state = encoder.encode(pictures.rgb, pictures.depth), encoder.view.robot(demos.observations)[rows]
     black = encoder.encode(np.zeros_like(pictures.rgb[:1]), np.zeros_like(pictures.depth[:1])).repeat(len(rows), axis=0)
     results = {}
-    for name, seen in (("its own", features[rows]), ("another episode's", features[other]), ("black", black)):
+    average = features.mean(axis=0, keepdims=True).repeat(len(rows), axis=0)
+    for name, seen in (("its own", features[rows]), ("another episode's", features[other]), ("the average", average), ("black", black)):
         actions = policy.act(np.concatenate([state, seen], axis=1)[:, None].repeat(policy.window, axis=1))[:, 0]
         results[name] = float(np.sqrt(np.mean((actions - demos.actions) ** 2)))
     return results

@@ -165,8 +165,9 @@ def test_differences_are_paired_by_seed():
 def test_own_runs_find_their_recorded_cell():
     cells = {cell["recipe"] for cell in load_spec(DATA.parent / "data" / "sweeps" / "ablations.toml").cells}
     named = {ablations.cell_of(0.1, 8_000, 16_000), ablations.cell_of(1, 0, 600), ablations.cell_of(0.1, 40_000, 40_000),
-             ablations.cell_of(0.1, 300, 600, "residual"), ablations.cell_of(0.1, 300, 600, "sum", "obs+base")}
-    assert named <= cells and ablations.GRID in named and len(named) == 5
+             ablations.cell_of(0.1, 300, 600, "residual"), ablations.cell_of(0.1, 300, 600, "residual", units="bound"),
+             ablations.cell_of(0.1, 300, 600, "sum", "obs+base", "bound")}
+    assert named <= cells and ablations.GRID in named and len(named) == 6
     assert ablations.cell_of(0.3, 0, 10, "concat") == "alpha=0.3,H=0,critic_input=concat"
 
 

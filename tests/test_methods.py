@@ -121,6 +121,20 @@ def test_rlpd_has_the_numbers_of_the_original():
     assert (lesson.num_critics, lesson.target_subset, lesson.actor_value, lesson.entropy_backup) == (10, 2, "mean", False)
 
 
+@pytest.mark.parametrize("method, spread", [("rlpd", 0.6), ("calql_a", 0.37), ("calql_b", 0.37), ("calql_c", 0.37)])
+def test_originals_start_with_their_own_spread(method, spread):
+    """Not with the 1e-4 of the paper's code, in which neither explores nor finds its actions among sampled ones."""
+    sac = method_config(method, "Door", "paper").sac
+    assert np.exp(np.mean(sac.log_std_range)) == pytest.approx(spread, abs=0.01)
+    assert (sac.xavier_init, sac.init_temperature) == ((True, 1.0) if method == "rlpd" else (False, 0.1))
+
+
+@pytest.mark.parametrize("profile", ["lesson", "paper"])
+def test_fish_shows_its_critics_what_is_added(profile):
+    config = method_config("fish", "Door", profile).decorator
+    assert (config.critic_input, config.residual_units, config.alpha) == ("concat", "action", 0.2)
+
+
 @pytest.mark.parametrize("profile", ["lesson", "paper"])
 def test_the_papers_rlpd_adds_layer_norm_and_demonstrations_to_fine_tuning(profile):
     """Appendix B.5: and neither ensemble nor a high update-to-data ratio."""

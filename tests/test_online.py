@@ -353,6 +353,7 @@ def test_the_paper_profile_is_the_official_recipe():
     assert (c.sac.layers, c.sac.hidden, c.sac.actor_every, c.sac.residual_penalty) == (3, 256, 1, 0.0)
     assert (c.train_limit, c.success_tail, c.lr_decay_from, c.normalize_obs) == (0, 0, 1.0, False)
     assert (c.decorator.critic_input, c.decorator.actor_input, c.sac.critic_layer_norm, c.sac.average) == ("sum", "obs", False, 0.0)
+    assert c.decorator.residual_units == "bound" and online_config("StackCube").decorator.residual_units == "action"
     assert [online_config(task, "paper").sac.xavier_init for task in ("PushChair", "TurnFaucet")] == [True, False]
     chunks = policy_values("TurnFaucet", "paper", "diffusion", 4)  # the script counts chunks
     assert (chunks["total_steps"], chunks["eval_every"]) == (8_000_000, 200_000)

@@ -569,6 +569,7 @@ def test_what_a_picture_is_worth():
     others = np.repeat(goals[[1, 2, 0]] - goals, demos.lengths)
     assert worth["its own"] == 0 and worth["another episode's"] == pytest.approx(np.sqrt((others**2).mean()), rel=1e-4)
     assert worth["black"] == pytest.approx(np.sqrt((acted**2).mean()), rel=1e-5)
+    assert worth["the average"] == pytest.approx(np.sqrt(((own.mean() - acted) ** 2).mean()), rel=1e-4)
 
 
 def test_a_probe_tells_what_the_features_hold():

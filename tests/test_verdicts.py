@@ -512,7 +512,7 @@ def test_pictures_are_judged_by_one_run_and_never_reproduced(results, solved, ve
     assert found.verdict == verdict and f"from 40.0 % to {100 * solved:.1f} %" in found.measured and "Wilson" in found.interval
     write(results, "pixels", *rows, runs("pixels", [0.9], base=0.4, episodes=40, command="y", task="TurnFaucet"))
     found = verdicts.find("Policy Decorator improves base policies that see pictures as well")
-    assert found.verdict == verdict if solved > 0.8 else "partly"  # tasks on different sides
+    assert found.verdict == "partly"  # one task is improved, whichever side the other is on
     assert "; TurnFaucet, one seed: from 40.0 % to 90.0 %" in found.measured and found.tasks == "Door TurnFaucet"
 
 

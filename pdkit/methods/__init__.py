@@ -96,8 +96,9 @@ METHODS: dict[str, Method] = {
         trainer="pdkit.methods.rot:ROT"),
     "fish": Method(
         "FISH", "Haldar et al. 2023; appendix B.5, G.2; facts.md 3.6: residual over VINN on a reward by optimal transport",
-        changes=dict(alpha=0.2, alpha_scale=(), H=0, critic_input="concat", actor_input="obs+base", warmup="uniform", demo_fraction=0.0,
-                     reward_shift=0.0, residual_penalty=0.0), lesson=_LIKENESS, base="vinn", trainer="pdkit.methods.fish:FISH"),
+        changes=dict(alpha=0.2, alpha_scale=(), H=0, critic_input="concat", residual_units="action", actor_input="obs+base",
+                     warmup="uniform", demo_fraction=0.0, reward_shift=0.0, residual_penalty=0.0),
+        lesson=_LIKENESS, base="vinn", trainer="pdkit.methods.fish:FISH"),
     "calql": Method(
         "Cal-QL", "Nakamoto et al. 2023; appendix B.5, F.3 (E); facts.md 3.3: imitated transformer, demonstrations, online SAC",
         changes=_CALQL | dict(demo_fraction=0.0), lesson=_TRANSFORMER, paper=_CALQL_PAPER, base="bet-sac",

@@ -5,10 +5,10 @@
     128 x 128   one stage more than for 64 x 64: 16, 16, 32, 64, 128. The paper's encoder for Adroit is not known; this is ours
     then        a 1 x 1 convolution to 128 channels (for 50 x 125 the one above), and a linear layer with a ReLU to 256 features
 
-It starts without biases, as ManiSkill's PlainConv does (haosulab/ManiSkill, examples/baselines/diffusion_policy; the file that the
-paper's code imports is not in its repository), and with He's weights (He et al. 2015), which is ours: each layer keeps the spread of
-what it is given. PyTorch's own weights and biases make features of a picture that vary by a ten-thousandth around constants, and a policy
-that imitates for a thousand gradient steps with them learns everything but to look (data/RESULTS.md, "Pixels").
+It starts without biases, as ManiSkill's PlainConv does (haosulab/ManiSkill, examples/baselines/diffusion_policy; the paper's own file
+was not at hand), and with He's weights (He et al. 2015), which is ours: each layer keeps the spread of what it is given. With PyTorch's
+own weights and biases features vary by two or three ten-thousandths around constants, and a policy that imitates for hundreds of
+gradient steps learns everything but to look (data/RESULTS.md, "Pixels").
 
 Colours come in as bytes, distances in 1/1024 metre; the network sees both divided by their units.
 """

@@ -142,8 +142,8 @@ def _() -> Finding:
     return finding("pixels", rows.set_index(["task", "seed"]).decorated_success,
                    "; ".join(f"{row.task}, one seed: from {percent(row.base_success)} to {percent(row.decorated_success)}"
                              for row in rows.itertuples()),
-                   "; ".join(f"{percent(rate.low)} to {percent(rate.high)}" for rate in solved)
-                   + f" (Wilson over {int(rows.episodes.iloc[0])} test episodes, 95 %)",
+                   "; ".join(f"{percent(rate.low)} to {percent(rate.high)} (Wilson over {int(episodes)} test episodes, 95 %)"
+                             for rate, episodes in zip(solved, rows.episodes, strict=True)),
                    "partly" if any(improved) else "not", ("TurnFaucet", "PushChair"))
 
 
