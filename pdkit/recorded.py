@@ -53,9 +53,9 @@ def record(name: str, rows: pd.DataFrame, curves: pd.DataFrame) -> None:
 
 
 def picture_of(name: str, task: str, table: pd.DataFrame) -> str:
-    """What the picture of a task is called: NAME of Door, or of the first task where Door is none of them, NAME_TASK of the others."""
+    """What the picture of a task is called: NAME of Door, or of the first task where Door is none of them, NAME-TASK of the others."""
     first = "Door" if "Door" in set(table.task) else table.task.iloc[0]
-    return name if task == first else f"{name}_{task.lower()}"
+    return name if task == first else f"{name}-{task}"
 
 
 def _on_own_objects(table: pd.DataFrame) -> pd.Series:

@@ -168,7 +168,7 @@ def test_a_record_of_another_task_alone_can_be_drawn(monkeypatch, tmp_path):
     curve = dict(task="StackCube", recipe="lesson", seed=0, step=[10, 20], success_once=[0.5, 0.9])
     recorded.record("s", pd.DataFrame([row]), pd.DataFrame(curve))
     assert (tmp_path / "results" / "s.png").stat().st_size > 1000
-    for task, names in (("Pen", ("s", "s_stackcube")), ("Door", ("s", "s_pen", "s_stackcube"))):  # each task has its own, Door the first
+    for task, names in (("Pen", ("s", "s-StackCube")), ("Door", ("s", "s-Pen", "s-StackCube"))):  # each task has its own, Door the first
         recorded.record("s", pd.DataFrame([row | {"task": task}]), pd.DataFrame(curve | {"task": task}))
         assert sorted(path.stem for path in (tmp_path / "results").glob("*.png")) == sorted(names)
     shown = [part for part in report.sections(pd.DataFrame(columns=["verdict", "claim", "section", "tasks"]),
