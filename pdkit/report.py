@@ -136,7 +136,8 @@ def sections(claims: pd.DataFrame, tables: dict[str, pd.DataFrame], folder: Path
         rows = table.drop(columns=["command", "sweep"], errors="ignore").to_dict("records")
         shown = [page.details(f"{len(table)} rows", page.table(rows)),
                  page.details("How to make them again", page.code("\n".join(again)))]
-        pictures = [(folder / f"{picture_of(name, task, table)}.png", task) for task in dict.fromkeys(table.task)]
+        tasks = dict.fromkeys(table["task"]) if "task" in table else ()
+        pictures = [(folder / f"{picture_of(name, task, table)}.png", task) for task in tasks]
         drawn = [page.figure(path, f"{name}.csv, {task}") for path, task in pictures if path.exists()]
         parts.append(page.Section(f"Recorded: {name}", drawn + shown))
     return parts
