@@ -218,7 +218,8 @@ def test_residual_rl_and_fish_on_the_cube(tmp_path):
 
 def test_ablations(tmp_path):
     result = run("13", tmp_path, alpha=0.3, critic_input="concat")
-    assert result["recipe"] == "alpha=0.3,H=0,critic_input=concat" and result["env_steps"] >= 600 and result["episodes"] == 2
+    assert result["recipe"] == "alpha=0.3,H=0,critic_input=concat,residual_units=bound"
+    assert result["env_steps"] >= 600 and result["episodes"] == 2
     assert result["scales"]["mean |a_t - a_(t-1)|"] == pytest.approx(0.111, abs=0.001) and len(result["claims"]) == 11
     assert (tmp_path / "grid_curves.png").exists() and result["exercise_solved"] is False
 
