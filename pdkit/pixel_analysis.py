@@ -111,8 +111,8 @@ def errors(policy: Policy, encoder: Encoder, demos: Demos, pictures: Pictures) -
                             for i, length in enumerate(demos.lengths)])
     features, state = encoder.encode(pictures.rgb, pictures.depth), encoder.view.robot(demos.observations)[rows]
     black = encoder.encode(np.zeros_like(pictures.rgb[:1]), np.zeros_like(pictures.depth[:1])).repeat(len(rows), axis=0)
-    results = {}
     average = features.mean(axis=0, keepdims=True).repeat(len(rows), axis=0)
+    results = {}
     for name, seen in (("its own", features[rows]), ("another episode's", features[other]), ("the average", average), ("black", black)):
         actions = policy.act(np.concatenate([state, seen], axis=1)[:, None].repeat(policy.window, axis=1))[:, 0]
         results[name] = float(np.sqrt(np.mean((actions - demos.actions) ** 2)))
