@@ -58,9 +58,9 @@ def paths(policy: Policy, seeds: range, spec: TaskSpec = PROBES["fork"]) -> list
 
 def noised(policy: DiffusionPolicy, actions: np.ndarray, steps: list[int], seed: int = 0) -> np.ndarray:
     """A sequence of actions (T, act_dim) at each of the diffusion `steps`, all with the same noise: (len(steps), T, act_dim)."""
-    clean = torch.from_numpy(np.asarray(actions, np.float32))
+    clean = policy.noisable(torch.from_numpy(np.asarray(actions, np.float32)))
     noise = torch.randn(clean.shape, generator=torch.Generator().manual_seed(seed))
-    return np.stack([policy.noise.add_noise(clean[None], noise[None], torch.tensor([k]))[0].numpy() for k in steps])
+    return np.stack([policy.executable(policy.noise.add_noise(clean[None], noise[None], torch.tensor([k])))[0].numpy() for k in steps])
 
 
 @torch.no_grad()
@@ -71,7 +71,7 @@ def denoising(policy: DiffusionPolicy, window: np.ndarray, seed: int = 0) -> tup
     forward = policy.unet.forward
 
     def watched(actions, steps, condition):
-        sequences.append(actions[0].numpy().copy())
+        sequences.append(policy.executable(actions[0]).numpy().copy())
         asked.append(int(steps[0]))
         return forward(actions, steps, condition)
 

@@ -94,6 +94,50 @@ def test_no_more_steps_have_a_network_of_their_own_than_there_are():
         policy(late_steps=9)
 
 
+def test_with_limits_noise_is_added_between_what_was_demonstrated_and_a_still_number_is_told_exactly():
+    """The first number runs from 0.2 to 0.6, the second is always -0.5."""
+    p, scaled = policy(action_limits=True), torch.rand(2, 8, 2) * 1.8 - 0.9
+    p.fit_statistics(np.zeros((3, 3), np.float32), np.array([[0.2, -0.5], [0.6, -0.5], [0.3, -0.5]], np.float32))
+    clean = torch.stack([0.4 + 0.2 * scaled[..., 0], torch.full((2, 8), -0.5)], dim=-1)
+    assert torch.allclose(p.noisable(clean)[..., 0], scaled[..., 0], atol=1e-6) and not p.noisable(clean)[..., 1].any()
+    p.unet = Oracle(p.noisable(clean))
+    assert p.loss(torch.randn(2, 2, 3), clean)["loss"] < 1e-4
+    assert torch.allclose(p.denoise(torch.randn(2, 2, 3), torch.randn(2, 8, 2)), clean, atol=1e-3)
+    p.unet = Silent()
+    assert torch.equal(p.denoise(torch.randn(2, 2, 3), torch.randn(2, 8, 2))[..., 1], clean[..., 1])
+    assert not p.noisable(torch.ones(1, 2))[..., 1].any()  # as when actions were moved to where no demonstration goes
+
+
+def test_without_limits_actions_are_noised_as_they_are():
+    p, actions = policy(), torch.rand(2, 8, 2)
+    p.fit_statistics(np.zeros((3, 3), np.float32), np.full((3, 2), 0.5, np.float32))
+    assert torch.equal(p.noisable(actions), actions) and torch.equal(p.executable(actions), actions)
+    assert not any("limits" in name for name in p.state_dict())  # so that older files still load
+
+
+def test_a_temperature_scales_the_noise_that_sampling_starts_from():
+    noise, windows = torch.randn(2, 8, 2), torch.randn(2, 2, 3)
+    cold, warm = policy(temperature=0.5), policy()
+    assert torch.equal(cold.denoise(windows, noise), warm.denoise(windows, 0.5 * noise))
+    still = policy(temperature=0.0)
+    windows = np.zeros((2, 2, 3), np.float32)
+    assert np.array_equal(still.act(windows), still.act(windows)) and not np.array_equal(cold.act(windows), cold.act(windows))
+    with pytest.raises(PdkitError, match='Only sampler="ddim"'):
+        policy(temperature=0.5, sampler="ddpm")
+
+
+def test_limits_go_to_disk(tmp_path):
+    p, windows = policy(action_limits=True), np.zeros((2, 2, 3), np.float32)
+    p.fit_statistics(np.eye(3, dtype=np.float32), np.array([[0.2, -0.5], [0.6, 0.1]], np.float32))
+    save_policy(p, tmp_path / "p")
+    again = load_policy(tmp_path / "p")
+    p.reset(1)
+    actions = p.act(windows)
+    again.reset(1)
+    assert np.array_equal(again.act(windows), actions)
+    assert (actions >= np.float32([0.2, -0.5]) - 1e-6).all() and (actions <= np.float32([0.6, 0.1]) + 1e-6).all()
+
+
 def test_a_chunk_begins_at_the_latest_observation():
     p, clean = policy(), torch.arange(16.0).view(1, 8, 2) / 20
     p.unet = Oracle(clean)

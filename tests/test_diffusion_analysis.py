@@ -56,6 +56,20 @@ def test_noising_and_denoising_are_the_policys_own(policy):
     assert np.array_equal(sequences[-1], policy.denoise(torch.from_numpy(window)[None], noise).detach()[0])
 
 
+def test_what_is_drawn_of_a_policy_with_limits_are_actions():
+    limited = clone(DiffusionPolicy, reach_demos(10), SMALL | {"action_limits": True}, iterations=2)
+    limited.limits.fit(np.float32([[0.2, -0.5], [0.6, 0.1]]))
+    clean = np.linspace(0.3, 0.0, 8, dtype=np.float32).reshape(4, 2)
+    middle, half = np.float32([0.4, -0.2]), np.float32([0.2, 0.3])
+    steps = analysis.noised(limited, clean, [0, 99])
+    assert np.abs(steps[0] - clean).max() < 0.05
+    assert np.allclose(steps[1], middle + half * torch.randn(4, 2, generator=torch.Generator().manual_seed(0)).numpy(), atol=0.05)
+    noise = torch.randn(1, 4, 2, generator=torch.Generator().manual_seed(1))
+    _, sequences = analysis.denoising(limited, np.zeros((2, 4), np.float32), seed=1)
+    assert np.allclose(sequences[0], middle + half * noise[0].numpy(), atol=1e-6)
+    assert np.array_equal(sequences[-1], limited.denoise(torch.zeros(1, 2, 4), noise).detach()[0])
+
+
 def test_variants_have_the_same_weights(policy):
     table = analysis.compare_sampling(policy, PROBES["reach"], {"as it is": {}, "one by one": dict(chunk=1)}, list(range(8)), lanes=4)
     other = analysis.resampled(policy, chunk=1)

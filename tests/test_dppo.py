@@ -112,6 +112,22 @@ def test_a_chain_takes_the_fine_tuned_network_for_its_last_steps_and_the_least_n
     assert torch.allclose(learner.act(obs[:1], wild)[0] - learner.act(obs[:1], calm)[0], torch.tensor(0.6), atol=1e-4)
 
 
+def test_a_chain_on_the_scale_of_limits_is_executed_off_it():
+    learner = agent(base=FOUR | {"action_limits": True})
+    noise = torch.randn(16, 5, 4, 2)
+    plain, _, chain = learner.act(torch.zeros(16, 8), noise)
+    learner.actor.limits.fit(np.float32([[0.2, -0.5], [0.6, 0.1]]))
+    actions, _, same = learner.act(torch.zeros(16, 8), noise)
+    middle, half = torch.tensor([0.4, -0.2]).repeat(2), torch.tensor([0.2, 0.3]).repeat(2)
+    assert torch.equal(chain, same) and torch.allclose(actions, middle + half * plain, atol=1e-6)
+
+
+def test_a_chain_starts_at_the_policys_temperature():
+    noise = torch.randn(16, 5, 4, 2)
+    _, _, chain = agent(late=4, base=FOUR | {"temperature": 0.5}).act(torch.zeros(16, 8), noise)
+    assert torch.equal(chain[:, 0], 0.5 * noise[:, 0])
+
+
 def test_rows_are_the_fine_tuned_steps_of_each_decision_with_a_discount_that_spares_the_last():
     learner = agent(late=3, dppo_gamma=0.5)
     data = rollout(learner)

@@ -203,6 +203,7 @@ BAD = [  # policy, setting as typed, what the sentence must name
     ("diffusion", "dims=[64,'x']", "a list"), ("diffusion", "window=0", "at least 1"), ("diffusion", "horizon=0", "at least 1"),
     ("diffusion", "diffusion_steps=0", "at least 1"), ("diffusion", "sampler_steps=4.0", "a whole number"),
     ("diffusion", "sampler=3", "a word"), ("diffusion", "prediction=x", "Unknown prediction"),
+    ("diffusion", "temperature=-1", "at least 0"), ("diffusion", "action_limits=1", "True or False"),
     ("diffusion", "late_steps=1", "Unknown field"), ("diffusion", "own_scale=True", "Unknown field"),
     ("mlp", "hidden=0", "at least 1"), ("mlp", "hidden=x", "a whole number"), ("mlp", "layers=-1", "at least 0"),
     ("mlp", "window=2", "one observation"), ("mlp", "std_floor=-1", "at least 0"),

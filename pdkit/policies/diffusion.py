@@ -8,6 +8,15 @@ With prediction="v_prediction" (Salimans and Ho, 2022; not in the paper) the net
 instead, from which both follow. Where all is noise that is the action itself; a network that must give the noise there has to pass
 its own input on through every layer to a high accuracy, which should take it more gradient steps (lesson 03 lets one compare).
 
+With action_limits what is noised are actions that run from -1 to 1 between the least and the greatest that was demonstrated, for each
+number by itself, as the original does it (Chi et al.'s code); the official code takes them as they are. Where a number hardly moves, as
+the 17 joints of PushChair's robot that no demonstration moves, noise of unit size leaves an error larger than the number itself, for far
+more gradient steps than a CPU makes. Such a policy cannot leave what was demonstrated, however it is fine-tuned; a residual can.
+
+With a temperature below 1 DDIM starts from less noise (low-temperature sampling, as in Janner et al., 2022, and Ajay et al., 2023; not
+in the paper), at 0 from none: sampled actions then scatter less around the likeliest, which matters where the demonstrator's own actions
+were noisy, or the network is not yet good at telling noise from actions.
+
 The sequence begins with the oldest observation of the window, so its first `window - 1` actions lie in the past. The last steps of
 sampling may have a network of their own: what DPPO fine-tunes (pdkit/rl/dppo.py), while the steps before them stay as imitated.
 """
@@ -30,17 +39,45 @@ SPACINGS = ("leading", "trailing")
 PREDICTIONS = ("epsilon", "v_prediction")
 
 
+class Limits(nn.Module):
+    """Actions on a scale from -1 to 1 between the least and the greatest demonstrated, per number; part of the checkpoint.
+
+    A number that never varies is 0 on that scale, and what it was off it, whatever the network says.
+    """
+
+    def __init__(self, dim: int):
+        super().__init__()
+        self.register_buffer("middle", torch.zeros(dim))
+        self.register_buffer("reach", torch.ones(dim))
+
+    @torch.no_grad()
+    def fit(self, actions: np.ndarray) -> None:
+        """From actions (N, dim)."""
+        least, greatest = actions.min(axis=0), actions.max(axis=0)
+        self.middle.copy_(torch.from_numpy((least + greatest) / 2))
+        self.reach.copy_(torch.from_numpy(np.where(greatest - least < 1e-4, 0.0, (greatest - least) / 2)))
+
+    def on(self, actions: torch.Tensor) -> torch.Tensor:
+        """Actions (..., dim) on the scale."""
+        return (actions - self.middle) / self.reach.clamp(min=1e-5) * (self.reach > 0)
+
+    def off(self, scaled: torch.Tensor) -> torch.Tensor:
+        """Actions (..., dim) that are `scaled` on it."""
+        return self.middle + self.reach * scaled
+
+
 class DiffusionPolicy(Policy):
     """Config: obs_dim, act_dim, window (observations), horizon (actions predicted), chunk (of them executed), dims, kernel, groups and
     embed of the U-Net, diffusion_steps of training, prediction ("epsilon", "v_prediction"), sampler ("ddim", "ddpm"), sampler_steps,
     spacing (of DDIM's steps: "leading", "trailing"), late_steps (the last so many steps of sampling have a network of their own; 0: one
-    for all), own_scale (the network's scale of observations is kept apart from the normaliser's: see `renormalise`), and std_floor (of
-    the normaliser)."""
+    for all), own_scale (the network's scale of observations is kept apart from the normaliser's: see `renormalise`), temperature (of the
+    noise that DDIM starts from), std_floor (of the normaliser), and action_limits (what is noised runs from -1 to 1 between the limits
+    of the demonstrated actions)."""
 
     kind = "diffusion"
     defaults: dict[str, Any] = dict(window=2, horizon=16, chunk=4, dims=[64, 128, 256], kernel=5, groups=8, embed=64, diffusion_steps=100,
                                     prediction="epsilon", sampler="ddim", sampler_steps=4, spacing="leading", late_steps=0,
-                                    own_scale=False, std_floor=0.0)
+                                    own_scale=False, temperature=1.0, std_floor=0.0, action_limits=False)
     least = dict(embed=4, late_steps=0)
     made = ("late_steps", "own_scale")  # by DPPO, and by imitation from pictures
     recipe: dict[str, Any] = dict(lr=1e-4, beta1=0.95, weight_decay=1e-6, schedule="cosine", lr_warmup=500, ema_power=0.75)
@@ -63,8 +100,12 @@ class DiffusionPolicy(Policy):
             raise PdkitError(f"Diffusion Policy's dims {c['dims']} must be multiples of its groups ({c['groups']}).")
         if not 1 <= c["sampler_steps"] <= c["diffusion_steps"]:
             raise PdkitError(f"sampler_steps must be from 1 to diffusion_steps ({c['diffusion_steps']}), not {c['sampler_steps']}.")
+        if c["temperature"] != 1 and c["sampler"] != "ddim":
+            raise PdkitError(f"Only sampler=\"ddim\" can start from less noise (temperature {c['temperature']:g}): the others add noise on "
+                             "the way.")
         self.normalizer = Normalizer(c["obs_dim"])
         self.scale = Normalizer(c["obs_dim"]) if c["own_scale"] else None
+        self.limits = Limits(c["act_dim"]) if c["action_limits"] else None
         self.unet = UNet(c["act_dim"], c["obs_dim"] * self.window, tuple(c["dims"]), c["kernel"], c["groups"], c["embed"])
         self.noise = _scheduler("ddpm", c)
         self.sampler = _scheduler(c["sampler"], c)
@@ -87,6 +128,16 @@ class DiffusionPolicy(Policy):
 
     def fit_statistics(self, observations: np.ndarray, actions: np.ndarray, seed: int = 0) -> None:
         self.normalizer.fit(observations, self.config["std_floor"])
+        if self.limits is not None:
+            self.limits.fit(actions)
+
+    def noisable(self, actions: torch.Tensor) -> torch.Tensor:
+        """Actions (..., act_dim) on the scale on which noise is added to them."""
+        return actions if self.limits is None else self.limits.on(actions)
+
+    def executable(self, sequences: torch.Tensor) -> torch.Tensor:
+        """What the network works on (..., act_dim), on any step of sampling, as actions of the environment."""
+        return sequences if self.limits is None else self.limits.off(sequences)
 
     def condition(self, windows: torch.Tensor) -> torch.Tensor:
         """What the U-Net sees of windows (N, window, obs_dim): (N, window * obs_dim)."""
@@ -122,24 +173,29 @@ class DiffusionPolicy(Policy):
         return torch.randn(shape), torch.randint(self.config["diffusion_steps"], (shape[0],))
 
     def loss(self, windows: torch.Tensor, actions: torch.Tensor, *drawn: torch.Tensor) -> dict[str, torch.Tensor]:
+        actions = self.noisable(actions)
         noise, steps = drawn or (x.to(actions.device) for x in self.draw(actions.shape))
         predicted = self.unet(self.noise.add_noise(actions, noise, steps), steps, self.condition(windows))
         wanted = noise if self.config["prediction"] == "epsilon" else self.noise.get_velocity(actions, noise, steps)
         return {"loss": F.mse_loss(predicted.float(), wanted)}
 
+    def start(self, noise: torch.Tensor) -> torch.Tensor:
+        """What sampling starts from, made of standard normal noise."""
+        return self.config["temperature"] * noise
+
     def denoise(self, windows: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
-        """All actions (N, horizon, act_dim) that pure noise of that shape becomes."""
-        actions, condition = noise, self.condition(windows)
+        """All actions (N, horizon, act_dim) that standard normal noise of that shape becomes."""
+        sequences, condition = self.start(noise), self.condition(windows)
         for number, step in enumerate(self.sampler.timesteps):
             # DDPM's fresh noise, too, comes from torch's generator on the CPU, on whichever device: checkpoints hold that one alone.
-            actions = self.sampler.step(self.predicted(number, actions, condition), step, actions,
-                                        generator=torch.default_generator).prev_sample
-        return actions
+            sequences = self.sampler.step(self.predicted(number, sequences, condition), step, sequences,
+                                          generator=torch.default_generator).prev_sample
+        return self.executable(sequences)
 
-    def predicted(self, number: int, actions: torch.Tensor, condition: torch.Tensor) -> torch.Tensor:
+    def predicted(self, number: int, sequences: torch.Tensor, condition: torch.Tensor) -> torch.Tensor:
         """The noise (or v) in sequences (N, horizon, act_dim), by the network in charge of step `number` of sampling (the first is 0)."""
         network = self.late if number >= self.sampling_steps - self.config["late_steps"] else self.unet
-        return network(actions, self.sampler.timesteps[number].expand(len(actions)).to(actions.device), condition).float()
+        return network(sequences, self.sampler.timesteps[number].expand(len(sequences)).to(sequences.device), condition).float()
 
     def forward(self, windows: torch.Tensor) -> torch.Tensor:
         noise = torch.randn(len(windows), self.horizon, self.config["act_dim"]).to(windows.device)

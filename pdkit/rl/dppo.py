@@ -94,7 +94,7 @@ class DPPO(PPO):
     def act(self, obs: torch.Tensor, noise: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Executed actions (B, act_dim), log pi (B, K_ft) and chains (B, K_ft + 1, horizon, act_dim) for stored windows (B, stored) and
         standard normal noise (B, 1 + steps, horizon, act_dim)."""
-        x, condition, total = noise[:, 0], self._condition(obs), len(self.steps.times)
+        x, condition, total = self.actor.start(noise[:, 0]), self._condition(obs), len(self.steps.times)
         chain, log_probs = [], []
         for number in range(total):
             numbers = torch.full((len(x),), number, device=x.device)
@@ -104,7 +104,7 @@ class DPPO(PPO):
             if number >= total - self.late:
                 chain.append(before)
                 log_probs.append(self.log_prob(mean, numbers, x))
-        return x[:, self.executed].flatten(1), torch.stack(log_probs, dim=1), torch.stack([*chain, x], dim=1)
+        return self.actor.executable(x[:, self.executed]).flatten(1), torch.stack(log_probs, dim=1), torch.stack([*chain, x], dim=1)
 
     @torch.no_grad()
     def _prepared(self, rollout, num_envs):
