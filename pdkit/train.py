@@ -78,13 +78,13 @@ def main(argv: list[str]) -> int:
     return (_base if args.kind == "base" else _decorated)(args)
 
 
-def parse_settings(settings: list[str]) -> dict[str, Any]:
-    """NAME=VALUE strings as a dict, values read as Python literals (bare words as strings)."""
+def parse_settings(settings: list[str], option: str = "--set") -> dict[str, Any]:
+    """NAME=VALUE strings as a dict, values read as Python literals (bare words as strings). Raises PdkitError, which names `option`."""
     values = {}
     for item in settings:
         name, equals, text = item.partition("=")
         if not equals or not name:
-            raise PdkitError(f"--set takes NAME=VALUE, not {item!r}.")
+            raise PdkitError(f"{option} takes NAME=VALUE, not {item!r}.")
         try:
             values[name] = ast.literal_eval(text)
         except (ValueError, SyntaxError):

@@ -12,18 +12,22 @@ from . import video
 from .cli import Parser
 from .decorated import Decorated, load_decorated
 from .demos.cli import Progress
-from .errors import PdkitError
+from .diffusion_analysis import resampled
+from .errors import PdkitError, unknown
 from .evaluate import evaluate
 from .oracle import by_bound
 from .pixels.encoders import Encoder
 from .pixels.task import encoder_of, pixel_spec
-from .policies import Policy, load_policy
+from .policies import DiffusionPolicy, Policy, load_policy
 from .recorded import record
 from .seeds import reported_seeds
 from .stats import wilson
 from .tasks import get_task
 from .tasks.spec import TaskSpec
 from .torch_setup import set_threads
+from .train import parse_settings
+
+SAMPLING = ("temperature", "sampler", "sampler_steps", "spacing", "chunk")  # of a Diffusion Policy, whatever it was trained with
 
 
 def load_any(folder: str | Path) -> tuple[str, Policy | Decorated]:
@@ -32,6 +36,17 @@ def load_any(folder: str | Path) -> tuple[str, Policy | Decorated]:
     if (folder / "decorated.json").exists():
         return "decorated", load_decorated(folder)
     return "base", load_policy(folder)
+
+
+def sampled(policy: Policy | Decorated, settings: dict[str, Any]) -> Policy | Decorated:
+    """The same weights with other sampling (SAMPLING); raises PdkitError for a policy that has none, or an unknown name."""
+    if not settings:
+        return policy
+    if not isinstance(policy, DiffusionPolicy):
+        raise PdkitError(f"--sampling is for a base policy that samples, a Diffusion Policy; this is a {type(policy).__name__}.")
+    if strange := set(settings) - set(SAMPLING):
+        raise unknown("sampling", min(strange), SAMPLING)
+    return resampled(policy, **settings)
 
 
 def transfer(policy: Policy | Decorated, tasks: Sequence[str], episodes: int, encoder: Encoder | None = None,
@@ -105,14 +120,19 @@ def main(argv: list[str]) -> int:
                                                        "its base does not solve, side by side")
     parser.add_argument("--oracle", nargs="+", type=float, metavar="ALPHA", help="success of a base policy that a demonstrator corrects by "
                         "at most so much (0: not at all; times the task's alpha_scale), instead: what a bound allows")
+    parser.add_argument("--sampling", nargs="+", metavar="NAME=VALUE", default=[], help="let a Diffusion Policy sample otherwise than it "
+                        f"was made to: {', '.join(SAMPLING)}")
     parser.add_argument("--threads", type=int, default=1)
     args = parser.parse_args(argv)
     if args.film and (args.oracle or args.record):
         raise PdkitError("--film writes an episode and nothing else; leave --oracle and --record out.")
+    if args.oracle and args.sampling:
+        raise PdkitError("--oracle corrects a base policy as it was made; leave --sampling out.")
     if args.episodes < 1:
         raise PdkitError(f"--episodes must be at least 1, not {args.episodes}.")
     set_threads(args.threads)
     kind, policy = load_any(args.policy)
+    policy = sampled(policy, parse_settings(args.sampling, "--sampling"))
     if args.film:
         if len(args.tasks) > 1 or encoder_of(args.policy):
             raise PdkitError("--film shows one task and policies that are told the state: name one task, and a policy without an encoder.")
@@ -124,6 +144,8 @@ def main(argv: list[str]) -> int:
     for row in rows.itertuples():
         print(f"{row.task}: {wilson(round(row.success * row.episodes), row.episodes)}; at the last step {row.success_at_end:.1%}")
     if args.record:
-        command = f"pdkit evaluate {args.policy} --tasks {' '.join(args.tasks)} --episodes {args.episodes} --record {args.record}"
-        record(args.record, rows.assign(recipe=kind, seed=0, command=command), pd.DataFrame())
+        asked = f" --sampling {' '.join(args.sampling)}" if args.sampling else ""
+        command = f"pdkit evaluate {args.policy} --tasks {' '.join(args.tasks)} --episodes {args.episodes}{asked} --record {args.record}"
+        recipe = ",".join([kind, *args.sampling])
+        record(args.record, rows.assign(recipe=recipe, seed=0, command=command), pd.DataFrame())
     return 0

@@ -14,7 +14,7 @@ from pdkit.decorated import Decorated, save_decorated
 from pdkit.decorator import DecoratorConfig
 from pdkit.errors import PdkitError
 from pdkit.files import DATA, read_json
-from pdkit.policies import save_policy
+from pdkit.policies import DiffusionPolicy, save_policy
 from pdkit.policies.mlp import MLP
 from pdkit.probes import PROBES, ProbeBase, ReachSim, biased_base
 from pdkit.rl.networks import Actor
@@ -121,3 +121,28 @@ def test_films_that_cannot_be_made_are_refused_in_a_sentence(tmp_path, capsys, m
     monkeypatch.setenv("PDKIT_RENDER", "off")
     assert cli.main(["evaluate", folder, "--tasks", "reach", "--film", str(tmp_path / "x.mp4")]) == 2
     assert "turned off" in capsys.readouterr().err and not list(tmp_path.iterdir())
+
+
+def test_a_diffusion_policy_samples_as_asked_and_others_do_not(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(recorded, "DATA", tmp_path / "data")
+    kept = DiffusionPolicy(dict(obs_dim=4, act_dim=2, horizon=4, chunk=2, dims=[16], groups=4, embed=16))
+    save_policy(kept, tmp_path / "base")
+    seen, evaluated = [], transfer.evaluate
+    monkeypatch.setattr(transfer, "evaluate", lambda spec, act, seeds, **options: seen.append((act.__self__.config, options["chunk"]))
+                        or evaluated(spec, act, seeds, **options))
+    words = ["evaluate", str(tmp_path / "base"), "--tasks", "reach", "--episodes", "3"]
+    assert cli.main([*words, "--record", "s"]) == 0
+    other = ["--sampling", "temperature=0", "chunk=1", "--record", "s"]
+    assert cli.main([*words, *other]) == 0
+    assert [(config["temperature"], chunk) for config, chunk in seen] == [(1.0, 2), (0, 1)]
+    table = pd.read_csv(tmp_path / "data" / "results" / "s.csv").set_index("recipe")
+    assert table.command["base,temperature=0,chunk=1"] == " ".join(["pdkit", *words, *other])
+    assert "base" in table.index
+    capsys.readouterr()
+    for asked, told in (("horizon=8", "Unknown sampling"), ("temperature", "--sampling takes NAME=VALUE"), ("chunk=9", "fit between"),
+                        ("chunk=1 --oracle 0", "leave --sampling out")):
+        assert cli.main([*words, "--sampling", *asked.split()]) == 2
+        assert told in capsys.readouterr().err
+    save_policy(MLP(dict(obs_dim=4, act_dim=2)), tmp_path / "mlp")
+    assert cli.main(["evaluate", str(tmp_path / "mlp"), "--tasks", "reach", "--sampling", "chunk=1"]) == 2
+    assert "a Diffusion Policy; this is a MLP" in capsys.readouterr().err
