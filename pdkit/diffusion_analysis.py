@@ -66,7 +66,7 @@ def noised(policy: DiffusionPolicy, actions: np.ndarray, steps: list[int], seed:
 @torch.no_grad()
 def denoising(policy: DiffusionPolicy, window: np.ndarray, seed: int = 0) -> tuple[list[int], np.ndarray]:
     """How the policy's sampler goes from noise to actions for one window (window, obs_dim): the diffusion steps at which the network
-    was asked, and the sequences (1 + steps, horizon, act_dim), from pure noise to what is executed."""
+    was asked, and the sequences (1 + steps, horizon, act_dim), from what it starts from to what is executed."""
     sequences, asked = [], []
     forward = policy.unet.forward
 
@@ -85,7 +85,7 @@ def denoising(policy: DiffusionPolicy, window: np.ndarray, seed: int = 0) -> tup
 
 
 def resampled(policy: DiffusionPolicy, **changes) -> DiffusionPolicy:
-    """The same weights with another sampler, sampler_steps or chunk."""
+    """The same weights with another sampler, sampler_steps, spacing, temperature or chunk."""
     other = DiffusionPolicy(policy.config | changes)
     other.load_state_dict(policy.state_dict())
     return other.eval()

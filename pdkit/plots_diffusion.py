@@ -120,6 +120,22 @@ def sampling_figure(table: pd.DataFrame, title: str = "") -> Picture:
     return figure
 
 
+@styled
+def temperature_figure(table: pd.DataFrame) -> Picture:
+    """Success against how much noise sampling starts from, a panel a task. Rows of `task_range.by_temperature`."""
+    tasks = list(dict.fromkeys(table.task))
+    figure, axes = blank(1, len(tasks), (1.6 * len(tasks), 2.6), sharey=True)
+    for ax, task, color in zip(axes[0], tasks, PALETTE, strict=False):
+        rows = table[table.task == task]
+        errors = np.stack([rows.success - rows.low, rows.high - rows.success])
+        ax.errorbar(rows.temperature, rows.success, errors, color=color, marker="o", ms=5, lw=1.6, capsize=2)
+        ax.set(title=task, xlim=(-0.15, table.temperature.max() + 0.15), ylim=(-0.02, 1.04), xlabel="temperature")
+        ax.set_xticks(sorted(rows.temperature))
+        ax.yaxis.set_major_formatter(mpl.ticker.PercentFormatter(1.0, decimals=0))
+    axes[0, 0].set_ylabel(f"success, {table.episodes.iloc[0]} episodes")
+    return figure
+
+
 def _flat(*axes: Axes) -> None:
     for ax in axes:
         ax.grid(axis="y", visible=False)

@@ -74,6 +74,22 @@ def over_diffusion() -> pd.DataFrame:
     return pd.DataFrame(rows).reindex(columns=COLUMNS)
 
 
+def by_temperature() -> pd.DataFrame:
+    """What `pdkit evaluate FOLDER --sampling temperature=T --record sampling` recorded of Diffusion Policies: task, temperature (the
+    highest first), episodes, success with Wilson's 95 % interval (low, high) and success_at_end; the task that gains most by a lower one
+    comes first. Empty where nothing is recorded."""
+    columns = ["task", "temperature", "episodes", "success", "low", "high", "success_at_end"]
+    try:
+        rows = load("sampling")[0]
+    except PdkitError:
+        return pd.DataFrame(columns=columns)
+    found = rows.recipe.str.extract(r"^base,temperature=([\d.]+)$")[0].astype(float)
+    rows = rows.assign(temperature=found).dropna(subset="temperature").sort_values("temperature", ascending=False)
+    gains = rows.groupby("task").success.agg(lambda rates: rates.iloc[-1] - rates.iloc[0])
+    return rows.assign(gain=rows.task.map(gains)).sort_values(["gain", "task", "temperature"], ascending=[False, True, False],
+                                                              ignore_index=True)[columns]
+
+
 def _demonstrations(task: str) -> dict[str, object]:
     try:
         demos = sources.bundled(task)

@@ -46,6 +46,8 @@ def sampled(policy: Policy | Decorated, settings: dict[str, Any]) -> Policy | De
         raise PdkitError(f"--sampling is for a base policy that samples, a Diffusion Policy; this is a {type(policy).__name__}.")
     if strange := set(settings) - set(SAMPLING):
         raise unknown("sampling", min(strange), SAMPLING)
+    if policy.config["late_steps"] and (strange := set(settings) - {"temperature", "chunk"}):
+        raise PdkitError(f"DPPO fine-tuned this policy's last steps of sampling as they are; {min(strange)} would change which these are.")
     return resampled(policy, **settings)
 
 
@@ -132,7 +134,7 @@ def main(argv: list[str]) -> int:
         raise PdkitError(f"--episodes must be at least 1, not {args.episodes}.")
     set_threads(args.threads)
     kind, policy = load_any(args.policy)
-    policy = sampled(policy, parse_settings(args.sampling, "--sampling"))
+    policy = sampled(policy, settings := parse_settings(args.sampling, "--sampling"))
     if args.film:
         if len(args.tasks) > 1 or encoder_of(args.policy):
             raise PdkitError("--film shows one task and policies that are told the state: name one task, and a policy without an encoder.")
@@ -146,6 +148,6 @@ def main(argv: list[str]) -> int:
     if args.record:
         asked = f" --sampling {' '.join(args.sampling)}" if args.sampling else ""
         command = f"pdkit evaluate {args.policy} --tasks {' '.join(args.tasks)} --episodes {args.episodes}{asked} --record {args.record}"
-        recipe = ",".join([kind, *args.sampling])
+        recipe = ",".join([kind, *(f"{name}={type(DiffusionPolicy.defaults[name])(value)}" for name, value in settings.items())])
         record(args.record, rows.assign(recipe=recipe, seed=0, command=command), pd.DataFrame())
     return 0

@@ -105,7 +105,22 @@ def test_with_limits_noise_is_added_between_what_was_demonstrated_and_a_still_nu
     assert torch.allclose(p.denoise(torch.randn(2, 2, 3), torch.randn(2, 8, 2)), clean, atol=1e-3)
     p.unet = Silent()
     assert torch.equal(p.denoise(torch.randn(2, 2, 3), torch.randn(2, 8, 2))[..., 1], clean[..., 1])
-    assert not p.noisable(torch.ones(1, 2))[..., 1].any()  # as when actions were moved to where no demonstration goes
+    beyond = p.noisable(torch.tensor([[1.0, 1.0], [-1.0, -1.0]]))  # as when DIPO has moved actions to where no demonstration goes
+    assert beyond.tolist() == [[1, 0], [-1, 0]]
+
+
+def test_a_range_of_next_to_nothing_is_none():
+    p = policy(action_limits=True)
+    p.fit_statistics(np.zeros((2, 3), np.float32), np.array([[0.2, 0.5], [0.2 + 5e-5, 0.5 + 3e-4]], np.float32))
+    assert p.limits.reach[0] == 0 and p.limits.reach[1] == pytest.approx(1.5e-4, rel=1e-3)
+    assert torch.allclose(p.noisable(torch.tensor([[0.9, 0.5 + 3e-4]])), torch.tensor([[0.0, 1.0]]), atol=1e-3)
+
+
+def test_a_late_network_keeps_limits_and_temperature():
+    p = policy(action_limits=True, temperature=0.5)
+    p.fit_statistics(np.zeros((2, 3), np.float32), np.array([[0.2, -0.5], [0.6, 0.1]], np.float32))
+    noise, windows = torch.randn(2, 8, 2), torch.randn(2, 2, 3)
+    assert torch.equal(p.with_late(2).denoise(windows, noise), p.denoise(windows, noise))
 
 
 def test_without_limits_actions_are_noised_as_they_are():
@@ -122,8 +137,10 @@ def test_a_temperature_scales_the_noise_that_sampling_starts_from():
     still = policy(temperature=0.0)
     windows = np.zeros((2, 2, 3), np.float32)
     assert np.array_equal(still.act(windows), still.act(windows)) and not np.array_equal(cold.act(windows), cold.act(windows))
-    with pytest.raises(PdkitError, match='Only sampler="ddim"'):
+    with pytest.raises(PdkitError, match="with ddpm set temperature=1"):
         policy(temperature=0.5, sampler="ddpm")
+    with pytest.raises(PdkitError, match="Unknown sampler"):
+        policy(temperature=0.5, sampler="x")
 
 
 def test_limits_go_to_disk(tmp_path):

@@ -274,6 +274,8 @@ def test_what_dipo_cannot_use_is_refused():
     for bad in (dict(alpha=0.5), dict(H=100), dict(warmup="uniform")):
         with pytest.raises(PdkitError, match="alpha=1"):
             start(policy(ONE_LEVEL), **bad)
+    with pytest.raises(PdkitError, match="has temperature 0"):
+        start(policy(ONE_LEVEL | {"temperature": 0.0}))
     for bad in (dict(dipo_steps=0), dict(dipo_lr=0.0), dict(dipo_norm=-1.0)):
         with pytest.raises(PdkitError, match="DIPO needs"):
             MethodConfig(**bad)

@@ -3,7 +3,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from pdkit import plots_range, task_range
+from pdkit import plots_diffusion, plots_range, task_range
 from pdkit.stats import wilson
 
 
@@ -63,6 +63,21 @@ def test_what_is_recorded_over_a_diffusion_policy(results):
     (row,) = task_range.over_diffusion().to_dict("records")
     assert (row["task"], row["suite"], row["policy"], row["seeds"], row["demos"]) == ("StackCube", "maniskill", "diffusion", 1, 300)
     assert row["base"] == pytest.approx(0.7) and row["decorated"] == pytest.approx(0.6) and row["at_end"] == pytest.approx(0.1)
+
+
+def test_rates_by_temperature_the_task_that_gains_most_first(results):
+    assert task_range.by_temperature().empty
+    rates = {"Pen": (0.5, 0.6, 0.4), "Door": (0.3, 0.8, 0.9)}
+    rows = [dict(task=task, recipe=f"base,temperature={t}", seed=0, episodes=100, success=rate, low=rate - 0.1, high=rate + 0.1,
+                 success_at_end=0.2) for task, three in rates.items() for t, rate in zip((1.0, 0.5, 0.0), three, strict=True)]
+    rows.append(rows[0] | dict(recipe="base,chunk=1", success=1.0))
+    pd.DataFrame(rows).to_csv(results / "sampling.csv", index=False)
+    table = task_range.by_temperature()
+    assert table.task.tolist() == ["Door"] * 3 + ["Pen"] * 3 and table.temperature.tolist() == [1, 0.5, 0] * 2
+    assert table.success.tolist() == [0.3, 0.8, 0.9, 0.5, 0.6, 0.4]
+    door, pen = plots_diffusion.temperature_figure(table).axes
+    assert (door.get_title(loc="left"), pen.get_title(loc="left")) == ("Door", "Pen")
+    assert sorted(map(tuple, np.round(pen.lines[0].get_xydata(), 3).tolist())) == [(0, 0.4), (0.5, 0.6), (1, 0.5)]
 
 
 def test_the_figure_of_bounds_has_a_panel_a_task_and_a_diamond_where_something_was_learned():

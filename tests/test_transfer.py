@@ -136,13 +136,17 @@ def test_a_diffusion_policy_samples_as_asked_and_others_do_not(tmp_path, monkeyp
     assert cli.main([*words, *other]) == 0
     assert [(config["temperature"], chunk) for config, chunk in seen] == [(1.0, 2), (0, 1)]
     table = pd.read_csv(tmp_path / "data" / "results" / "s.csv").set_index("recipe")
-    assert table.command["base,temperature=0,chunk=1"] == " ".join(["pdkit", *words, *other])
+    assert table.command["base,temperature=0.0,chunk=1"] == " ".join(["pdkit", *words, *other])
     assert "base" in table.index
     capsys.readouterr()
     for asked, told in (("horizon=8", "Unknown sampling"), ("temperature", "--sampling takes NAME=VALUE"), ("chunk=9", "fit between"),
                         ("chunk=1 --oracle 0", "leave --sampling out")):
         assert cli.main([*words, "--sampling", *asked.split()]) == 2
         assert told in capsys.readouterr().err
+    save_policy(kept.with_late(2), tmp_path / "late")
+    for asked, rc in (("sampler_steps=2", 2), ("temperature=0.5", 0)):
+        assert cli.main(["evaluate", str(tmp_path / "late"), "--tasks", "reach", "--episodes", "3", "--sampling", asked]) == rc
+    assert "sampler_steps would change which these are" in capsys.readouterr().err
     save_policy(MLP(dict(obs_dim=4, act_dim=2)), tmp_path / "mlp")
     assert cli.main(["evaluate", str(tmp_path / "mlp"), "--tasks", "reach", "--sampling", "chunk=1"]) == 2
     assert "a Diffusion Policy; this is a MLP" in capsys.readouterr().err

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..errors import PdkitError
 from ..policies.lora import with_lora
 from ..rl.dipo import DIPO as Learner
 from ..rl.dipo import ActionGradient, Sequences
@@ -21,6 +22,11 @@ from .diffusion import FineTuneDiffusion
 
 class DIPO(FineTuneDiffusion):
     """Every decision goes to two replays: what was executed to the critics', the whole sequence to the actor's."""
+
+    def __init__(self, config, base, demos=None, spec=None):
+        super().__init__(config, base, demos, spec)
+        if not base.config["temperature"]:
+            raise PdkitError("DIPO explores by the noise that its policy samples from, and this one has temperature 0: take one with more.")
 
     def _make_agent(self) -> Learner:
         c, m, start = self.config, self.config.method_config, self._start_policy

@@ -9,13 +9,14 @@ instead, from which both follow. Where all is noise that is the action itself; a
 its own input on through every layer to a high accuracy, which should take it more gradient steps (lesson 03 lets one compare).
 
 With action_limits what is noised are actions that run from -1 to 1 between the least and the greatest that was demonstrated, for each
-number by itself, as the original does it (Chi et al.'s code); the official code takes them as they are. Where a number hardly moves, as
-the 17 joints of PushChair's robot that no demonstration moves, noise of unit size leaves an error larger than the number itself, for far
-more gradient steps than a CPU makes. Such a policy cannot leave what was demonstrated, however it is fine-tuned; a residual can.
+number by itself, as the original does it by default (Chi et al.'s LinearNormalizer); the official code takes them as they are. A number
+that never varies stays what it was (there the network's error passes through). PushChair's demonstrations move 3 of 20 numbers, and
+noise of unit size in the other 17 leaves errors that the robot feels. Such a policy, sampled as it is evaluated, keeps to what was
+demonstrated, however it is fine-tuned; a residual need not.
 
-With a temperature below 1 DDIM starts from less noise (low-temperature sampling, as in Janner et al., 2022, and Ajay et al., 2023; not
-in the paper), at 0 from none: sampled actions then scatter less around the likeliest, which matters where the demonstrator's own actions
-were noisy, or the network is not yet good at telling noise from actions.
+With a temperature below 1 DDIM starts from less noise, at 0 from none, so that sampled actions scatter less (low-temperature sampling,
+as in Ajay et al.'s code, 2023, which scales the noise of every DDPM step, too; not in the paper). That matters where the network does
+not yet tell noise from actions well (data/results/sampling.csv).
 
 The sequence begins with the oldest observation of the window, so its first `window - 1` actions lie in the past. The last steps of
 sampling may have a network of their own: what DPPO fine-tunes (pdkit/rl/dppo.py), while the steps before them stay as imitated.
@@ -37,12 +38,14 @@ from .unet import UNet
 SAMPLERS = ("ddim", "ddpm")
 SPACINGS = ("leading", "trailing")
 PREDICTIONS = ("epsilon", "v_prediction")
+NEVER = 1e-4  # a demonstrated number whose range is below this never varies
 
 
 class Limits(nn.Module):
     """Actions on a scale from -1 to 1 between the least and the greatest demonstrated, per number; part of the checkpoint.
 
-    A number that never varies is 0 on that scale, and what it was off it, whatever the network says.
+    A number that never varies is 0 on that scale, and what it was off it, whatever the network says. What lies beyond the limits, as
+    actions can that keep still after a demonstration's end or that DIPO has moved, counts as the nearer limit.
     """
 
     def __init__(self, dim: int):
@@ -55,11 +58,11 @@ class Limits(nn.Module):
         """From actions (N, dim)."""
         least, greatest = actions.min(axis=0), actions.max(axis=0)
         self.middle.copy_(torch.from_numpy((least + greatest) / 2))
-        self.reach.copy_(torch.from_numpy(np.where(greatest - least < 1e-4, 0.0, (greatest - least) / 2)))
+        self.reach.copy_(torch.from_numpy(np.where(greatest - least < NEVER, 0.0, (greatest - least) / 2)))
 
     def on(self, actions: torch.Tensor) -> torch.Tensor:
         """Actions (..., dim) on the scale."""
-        return (actions - self.middle) / self.reach.clamp(min=1e-5) * (self.reach > 0)
+        return ((actions - self.middle) / self.reach.clamp(min=NEVER / 2)).clamp(-1, 1) * (self.reach > 0)
 
     def off(self, scaled: torch.Tensor) -> torch.Tensor:
         """Actions (..., dim) that are `scaled` on it."""
@@ -100,15 +103,15 @@ class DiffusionPolicy(Policy):
             raise PdkitError(f"Diffusion Policy's dims {c['dims']} must be multiples of its groups ({c['groups']}).")
         if not 1 <= c["sampler_steps"] <= c["diffusion_steps"]:
             raise PdkitError(f"sampler_steps must be from 1 to diffusion_steps ({c['diffusion_steps']}), not {c['sampler_steps']}.")
-        if c["temperature"] != 1 and c["sampler"] != "ddim":
-            raise PdkitError(f"Only sampler=\"ddim\" can start from less noise (temperature {c['temperature']:g}): the others add noise on "
-                             "the way.")
         self.normalizer = Normalizer(c["obs_dim"])
         self.scale = Normalizer(c["obs_dim"]) if c["own_scale"] else None
         self.limits = Limits(c["act_dim"]) if c["action_limits"] else None
         self.unet = UNet(c["act_dim"], c["obs_dim"] * self.window, tuple(c["dims"]), c["kernel"], c["groups"], c["embed"])
         self.noise = _scheduler("ddpm", c)
         self.sampler = _scheduler(c["sampler"], c)
+        if c["temperature"] != 1 and c["sampler"] != "ddim":
+            raise PdkitError(f"A temperature (here {c['temperature']:g}) is for sampler=\"ddim\" alone, which has no noise but the "
+                             f"first; with {c['sampler']} set temperature=1.")
         self.sampler.set_timesteps(c["sampler_steps"] if c["sampler"] == "ddim" else c["diffusion_steps"])
         if not 0 <= c["late_steps"] <= self.sampling_steps:
             raise PdkitError(f"late_steps, the steps with a network of their own, must be from 0 to all {self.sampling_steps} of the "

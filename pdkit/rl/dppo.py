@@ -2,7 +2,7 @@
 
 Two decision processes in one: the environment's, in which a chunk of actions is one decision, and within each decision the chain
 
-    x_K ~ N(0, I),   x_{k-1} = mu_k + max(sigma_k, least) * noise,   ...,   x_0 the sequence whose chunk is executed
+    x_K ~ temperature * N(0, I),   x_{k-1} = mu_k + max(sigma_k, least) * noise,   ...,   x_0 the sequence whose chunk is executed
 
 of which the last K_ft steps are fine-tuned, by a network of their own, and those before them go through the imitated one. With abar the
 noise schedule at step k and abar' at the next step taken (k - 1, or further with DDIM; 1 after the last):
@@ -15,6 +15,8 @@ noise schedule at step k and abar' at the next step taken (k - 1, or further wit
     A_k      gamma_denoise^k * A,   k = 0 at the last step, K_ft - 1 at the noisiest fine-tuned one; A by GAE over decisions
     c_k      first + (last - first) * (exp(rate * t) - 1) / (exp(rate) - 1),   t from 0 at the noisiest step to 1 at the last
     value    1/2 mean (V(s) - R)^2,   of the environment's state alone: one value for all steps of a decision
+
+With the policy's action_limits a chain, the least noise and the clip are on the scale of these limits; x_0 is taken off it to be executed.
 
 What learns is not quite what is evaluated: while it learns, a chain is sampled with eta = 1, and with noise of at least `least` in every
 step, also in those before the fine-tuned ones; evaluated and saved is the policy with the sampler of its imitation, for DDIM eta = 0:
