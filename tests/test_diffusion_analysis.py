@@ -59,7 +59,7 @@ def test_noising_and_denoising_are_the_policys_own(policy):
 def test_what_is_drawn_of_a_policy_with_limits_are_actions():
     limited = clone(DiffusionPolicy, reach_demos(10), SMALL | {"action_limits": True}, iterations=2)
     limited.limits.fit(np.float32([[0.2, -0.5], [0.6, 0.1]]))
-    clean = np.linspace(0.3, 0.0, 8, dtype=np.float32).reshape(4, 2)
+    clean = np.stack([np.linspace(0.25, 0.55, 4), np.linspace(-0.4, 0.05, 4)], axis=1).astype(np.float32)  # within the limits
     middle, half = np.float32([0.4, -0.2]), np.float32([0.2, 0.3])
     steps = analysis.noised(limited, clean, [0, 99])
     assert np.abs(steps[0] - clean).max() < 0.05
