@@ -11,7 +11,8 @@ from .demos import Demos
 from .evaluate import evaluate
 from .policies import DiffusionPolicy, Policy
 from .probes import PROBES, ForkSim
-from .stats import paired
+from .seeds import reported_seeds
+from .stats import Rate, paired, wilson
 from .tasks.spec import TaskSpec
 
 
@@ -54,6 +55,17 @@ def paths(policy: Policy, seeds: range, spec: TaskSpec = PROBES["fork"]) -> list
                     break
         out.append(np.stack(seen))
     return out
+
+
+def at_fork(policy: Policy, seed: int = 0) -> tuple[Rate, list[np.ndarray], float]:
+    """How a policy does at the fork: its success on 100 test episodes, the `paths` of the first 30, and which share of those that pass
+    goes above the obstacle (a crash has no side; -1: none passes)."""
+    spec = PROBES["fork"]
+    policy.reset(seed)
+    table = evaluate(spec, policy.act, reported_seeds(100), window=policy.window, chunk=policy.chunk)
+    ways = paths(policy, reported_seeds(30), spec)
+    above = [path[np.argmax(path[:, 0] > 0.9), 1] > 0 for path in ways if path[-1, 0] > 1.9]
+    return wilson(int(table.success_once.sum()), len(table)), ways, float(np.mean(above)) if above else -1.0
 
 
 def noised(policy: DiffusionPolicy, actions: np.ndarray, steps: list[int], seed: int = 0) -> np.ndarray:

@@ -11,6 +11,7 @@ from pdkit.errors import PdkitError
 from pdkit.evaluate import evaluate
 from pdkit.policies import DiffusionPolicy
 from pdkit.probes import PROBES, ForkSim
+from pdkit.seeds import reported_seeds
 
 SMALL = dict(horizon=4, chunk=2, window=2, dims=[16, 32], groups=4, embed=16)
 
@@ -42,6 +43,31 @@ def test_demonstrations_pass_on_either_side_from_the_same_observations():
         above.append(at[np.argmax(at[:, 0] > 0.9), 1] > 0)
     assert above == [bool(k % 2) for k in range(20)]
     assert np.array_equal(analysis.fork_demos(20, 0.1, 3).actions, demos.actions)
+
+
+class Detour:
+    """Goes past the obstacle above where it starts above the line, else straight into it (`sides`: below instead)."""
+
+    window = chunk = 1
+
+    def __init__(self, sides=False):
+        self.sides = sides
+
+    def reset(self, seed):
+        self.seed = seed
+
+    def act(self, windows):
+        x, y = windows[:, -1, 0], windows[:, -1, 1]
+        up = np.where(y > 0, 1.0, -1.0 if self.sides else 0.0)
+        return np.stack([np.ones_like(x), np.where(x < 0.9, 0.7, -0.4) * up], axis=1)[:, None].astype(np.float32)
+
+
+def test_at_the_fork_a_crash_has_no_side():
+    rate, ways, above = analysis.at_fork(Detour())
+    assert rate.value == pytest.approx(np.mean([path[0, 1] > 0 for path in analysis.paths(Detour(), reported_seeds(100))]))
+    assert len(ways) == 30 and above == 1
+    rate, ways, above = analysis.at_fork(Detour(sides=True))
+    assert rate.value == 1 and above == pytest.approx(np.mean([path[0, 1] > 0 for path in ways])) and 0 < above < 1
 
 
 def test_noising_and_denoising_are_the_policys_own(policy):
