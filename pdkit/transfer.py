@@ -8,7 +8,7 @@ from typing import Any
 
 import pandas as pd
 
-from . import video
+from . import recorded, video
 from .cli import Parser
 from .decorated import Decorated, load_decorated
 from .demos.cli import Progress
@@ -19,7 +19,6 @@ from .oracle import by_bound
 from .pixels.encoders import Encoder
 from .pixels.task import encoder_of, pixel_spec
 from .policies import DiffusionPolicy, Policy, load_policy
-from .recorded import record
 from .seeds import reported_seeds
 from .stats import wilson
 from .tasks import get_task
@@ -94,11 +93,28 @@ def film(policy: Policy | Decorated, spec: TaskSpec, path: str | Path, episodes:
     return written
 
 
+def refuse_to_replace(name: str, tasks: Sequence[str], recipes: Sequence[str], folder: str) -> None:
+    """Raise PdkitError where data/results/NAME holds one of these rows (a task and recipe each) of a policy in another folder.
+
+    A row is known by its task and recipe, which do not tell two policies of one kind apart: recording would replace the other's.
+    """
+    path = recorded.DATA / "results" / f"{name}.csv"
+    if not path.exists():
+        return
+    rows = recorded.of_these_objects(pd.read_csv(path))
+    for row in rows[rows.task.isin(tasks) & rows.recipe.isin(recipes)].itertuples():
+        holder = str(row.command).removeprefix("pdkit evaluate ").partition(" --tasks ")[0]
+        if Path(holder).resolve() != Path(folder).resolve():
+            raise PdkitError(f"data/results/{name}.csv holds {row.task}'s {row.recipe!r} of {holder}, which recording {folder} would "
+                             "replace; choose another name for --record, or take that row out first.")
+
+
 def corrected(kind: str, policy: Policy | Decorated, args: argparse.Namespace) -> int:
     """`pdkit evaluate --oracle`: success by the bound (pdkit/oracle.py), printed, and recorded if asked, a row a task and bound."""
     if kind != "base" or encoder_of(args.policy):
         raise PdkitError("--oracle corrects a base policy that is told the state; name the folder of one.")
-
+    if args.record:
+        refuse_to_replace(args.record, args.tasks, [f"{policy.kind},alpha={alpha:g}" for alpha in args.oracle], args.policy)
     for task in args.tasks:
         rows = by_bound(get_task(task), policy, args.oracle, reported_seeds(args.episodes),
                         Progress(args.episodes * len(args.oracle), "episodes"))
@@ -108,7 +124,7 @@ def corrected(kind: str, policy: Policy | Decorated, args: argparse.Namespace) -
             again = [f"pdkit evaluate {args.policy} --tasks {task} --episodes {args.episodes} --oracle {alpha:g} --record {args.record}"
                      for alpha in rows.alpha]
             named = [f"{policy.kind},alpha={alpha:g}" for alpha in rows.alpha]
-            record(args.record, rows.assign(policy=policy.kind, recipe=named, seed=0, command=again), pd.DataFrame())
+            recorded.record(args.record, rows.assign(policy=policy.kind, recipe=named, seed=0, command=again), pd.DataFrame())
     return 0
 
 
@@ -142,12 +158,14 @@ def main(argv: list[str]) -> int:
         return 0
     if args.oracle:
         return corrected(kind, policy, args)
+    recipe = ",".join([kind, *(f"{name}={type(DiffusionPolicy.defaults[name])(value)}" for name, value in settings.items())])
+    if args.record:
+        refuse_to_replace(args.record, args.tasks, [recipe], args.policy)
     rows = transfer(policy, args.tasks, args.episodes, encoder_of(args.policy))
     for row in rows.itertuples():
         print(f"{row.task}: {wilson(round(row.success * row.episodes), row.episodes)}; at the last step {row.success_at_end:.1%}")
     if args.record:
         asked = f" --sampling {' '.join(args.sampling)}" if args.sampling else ""
         command = f"pdkit evaluate {args.policy} --tasks {' '.join(args.tasks)} --episodes {args.episodes}{asked} --record {args.record}"
-        recipe = ",".join([kind, *(f"{name}={type(DiffusionPolicy.defaults[name])(value)}" for name, value in settings.items())])
-        record(args.record, rows.assign(recipe=recipe, seed=0, command=command), pd.DataFrame())
+        recorded.record(args.record, rows.assign(recipe=recipe, seed=0, command=command), pd.DataFrame())
     return 0

@@ -79,6 +79,25 @@ def test_the_command_records_a_row_a_task_for_base_and_decorated(tmp_path, monke
     assert read_json(tmp_path / "results" / "gap_manifest.json")["again"] == sorted(set(table.command))
 
 
+def test_another_policys_row_is_not_replaced(tmp_path, monkeypatch, capsys):
+    """Neither by an evaluation nor by a corrected one, and before anything is evaluated; the same folder, however written, may."""
+    monkeypatch.setattr(recorded, "DATA", tmp_path / "data")
+    monkeypatch.chdir(tmp_path)
+    for name in ("one", "two"):
+        save_policy(MLP(dict(obs_dim=4, act_dim=2)), tmp_path / name)
+    monkeypatch.setattr(transfer, "by_bound", lambda spec, policy, alphas, seeds, progress: pd.DataFrame(
+        {"task": spec.name, "alpha": alphas, "episodes": len(seeds), "success": 1.0}))
+    for more, row in ([], "base"), (["--oracle", "0"], "mlp,alpha=0"):
+        words = ["--tasks", "reach", "--episodes", "2", "--record", "r", *more]
+        assert cli.main(["evaluate", "one", *words]) == cli.main(["evaluate", str(tmp_path / "one"), *words]) == 0
+        table = (tmp_path / "data" / "results" / "r.csv").read_bytes()
+        capsys.readouterr()
+        assert cli.main(["evaluate", "two", *words]) == 2
+        told = capsys.readouterr()
+        assert f"holds reach's '{row}' of {tmp_path / 'one'}" in told.err and "another name" in told.err and "reach:" not in told.out
+        assert (tmp_path / "data" / "results" / "r.csv").read_bytes() == table
+
+
 @pytest.mark.parametrize(("words", "message"), [
     (["nowhere", "--tasks", "reach"], "nowhere"), (["nowhere", "--tasks", "reach", "--episodes", "0"], "at least 1, not 0"),
     (["nowhere"], "--tasks")])
