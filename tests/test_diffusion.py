@@ -130,6 +130,26 @@ def test_without_limits_actions_are_noised_as_they_are():
     assert not any("limits" in name for name in p.state_dict())  # so that older files still load
 
 
+def test_what_film_sees_goes_through_the_layers_of_the_observations(tmp_path):
+    """By hand; they are trained with the rest, a late network shares them, and the policy comes back from disk."""
+    p = policy(obs_encoder=[10, 6])
+    p.fit_statistics(np.random.default_rng(0).normal(2, 3, (50, 3)).astype(np.float32), np.zeros((50, 2), np.float32))
+    windows, noise = torch.randn(4, 2, 3), torch.randn(4, 8, 2)
+    first, mish, second = p.obs_encoder
+    flat = ((windows - p.normalizer.mean) / p.normalizer.std).flatten(1)
+    wanted = torch.tanh(torch.log1p(torch.exp(flat @ first.weight.T + first.bias))) * (flat @ first.weight.T + first.bias)
+    assert isinstance(mish, torch.nn.Mish) and torch.allclose(p.condition(windows), wanted @ second.weight.T + second.bias, atol=1e-5)
+    assert p.film().in_features == 6
+    p.loss(windows, torch.rand(4, 8, 2))["loss"].backward()
+    assert all(layer.weight.grad.abs().max() > 0 for layer in (first, second))
+    assert any(x is first.weight for x in p.parameter_groups(0.0)[0]["params"])
+    with torch.no_grad():
+        assert torch.equal(p.with_late(2).denoise(windows, noise), p.denoise(windows, noise))
+        save_policy(p, tmp_path / "p")
+        assert torch.equal(load_policy(tmp_path / "p").denoise(windows, noise), p.denoise(windows, noise))
+    assert not any("obs_encoder" in name for name in policy().state_dict())  # so that older files still load
+
+
 def test_a_temperature_scales_the_noise_that_sampling_starts_from():
     noise, windows = torch.randn(2, 8, 2), torch.randn(2, 2, 3)
     cold, warm = policy(temperature=0.5), policy()
@@ -190,7 +210,8 @@ def test_the_samplers_own_noise_comes_from_the_cpus_generator(monkeypatch):
 @pytest.mark.parametrize(("changes", "message"), [
     (dict(horizon=7), "multiple of 2"), (dict(chunk=8), "fit between"), (dict(chunk=0), "at least 1"),
     (dict(dims=[10, 32]), "multiples of"), (dict(sampler="euler"), "Unknown sampler"), (dict(prediction="x"), "Unknown prediction"),
-    (dict(spacing="x"), "Unknown spacing"),
+    (dict(spacing="x"), "Unknown spacing"), (dict(obs_encoder=[8, 0]), "at least"), (dict(obs_encoder=[0.5]), "whole numbers"),
+    (dict(obs_encoder=8), "a list"),
     (dict(sampler_steps=0), "at least 1"), (dict(sampler_steps=101), "from 1 to")])
 def test_settings_that_do_not_fit_are_refused(changes, message):
     with pytest.raises(PdkitError, match=message):
@@ -284,9 +305,11 @@ def test_it_learns_two_ways_where_a_mean_would_be_neither():
     assert (np.sign(actions) == np.sign(actions[:, :1])).all(axis=1).mean() > 0.9  # a sequence does not change its mind
 
 
-def test_it_goes_where_the_observation_says():
+@pytest.mark.parametrize("widths", [[], [32, 32]])
+def test_it_goes_where_the_observation_says(widths):
     """On the reach probe, from demonstrations that go straight to the goal, in chunks of two actions."""
-    learned = clone(DiffusionPolicy, reach_demos(60), dict(horizon=4, chunk=2, dims=[16, 32], groups=4, embed=16), iterations=300)
+    settings = dict(horizon=4, chunk=2, dims=[16, 32], groups=4, embed=16, obs_encoder=widths)
+    learned = clone(DiffusionPolicy, reach_demos(60), settings, iterations=300)
     learned.reset(0)
     assert evaluate(PROBES["reach"], learned.act, range(500, 550), window=2, chunk=2).success_once.mean() > 0.4
 

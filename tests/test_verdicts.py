@@ -434,6 +434,15 @@ def test_tasks_that_contradict_each_other_are_no_verdict_on_their_mean():
     assert claims.judged(claims.mean_interval(values)) == "reproduced"
     assert claims.judged_over_tasks(values) == claims.judged_over_tasks(-values) == "partly"
     assert claims.judged_over_tasks(values, 0.6) == "not" and claims.judged_over_tasks(values, -0.2) == "reproduced"
+    assert claims.judged_over_tasks(pd.Series([0.5, 0.51, 0.52, -0.1, 0.1, -0.03], index)) == "partly"  # a mean is enough against it
+
+
+def test_a_tasks_mean_that_chance_explains_does_not_save_a_claim():
+    """Nothing on either task, on one of them by chance on the right side: not. Where that one tells it by itself: partly."""
+    index = pd.MultiIndex.from_product([["Door", "StackCube"], range(3)], names=["task", "seed"])
+    noise = pd.Series([0.05, -0.1, 0.08, -0.1, 0.05, 0.02], index)
+    assert noise["Door"].mean() > 0 > noise.mean() and claims.judged_over_tasks(noise) == "not"
+    assert claims.judged_over_tasks(pd.Series([0.05, 0.06, 0.07, -0.3, -0.2, -0.25], index)) == "partly"
 
 
 def test_a_sweep_halfway_through_changes_no_verdict(results):

@@ -149,10 +149,11 @@ def test_features_of_a_trained_behavior_transformer(tmp_path):
     assert np.allclose(policy.train().act(windows.numpy())[:, 0], actions)  # no dropout, even while something trains
 
 
-def test_film_features_of_a_policy_with_a_scale_of_its_own(tmp_path):
-    """One that was trained from pictures: normaliser and scale together are what its network sees."""
+@pytest.mark.parametrize("widths", [[], [8, 5]])
+def test_film_features_of_a_policy_with_a_scale_of_its_own(tmp_path, widths):
+    """One that was trained from pictures: normaliser and scale together are what its network sees, through the layers that it has."""
     demos = reach_demos(6)
-    diffusion = clone(DiffusionPolicy, demos, UNET | {"own_scale": True}, iterations=20)
+    diffusion = clone(DiffusionPolicy, demos, UNET | {"own_scale": True, "obs_encoder": widths}, iterations=20)
     windows = Windows(demos, 2, True).all()[0]
     with torch.no_grad():
         wanted = diffusion.film()(torch.nn.functional.mish(diffusion.condition(windows)))
@@ -161,6 +162,8 @@ def test_film_features_of_a_policy_with_a_scale_of_its_own(tmp_path):
     policy = VINN({"obs_dim": 4, "act_dim": 2, "representation": str(tmp_path / "d")})
     with torch.no_grad():
         assert torch.allclose(policy.features(windows), wanted, atol=1e-3)
+    save_policy(remembered(demos, diffusion, tmp_path / "again", k=1), tmp_path / "vinn")
+    assert ("obs_encoder.0.weight" in load_policy(tmp_path / "vinn").state_dict()) == bool(widths)
 
 
 def test_film_features_are_the_scales_and_shifts_that_the_blocks_get_less_the_steps_part():

@@ -18,12 +18,17 @@ With a temperature below 1 DDIM starts from less noise, at 0 from none, so that 
 as in Ajay et al.'s code, 2023, which scales the noise of every DDPM step, too; not in the paper). That matters where the network does
 not yet tell noise from actions well (data/results/sampling.csv).
 
+With obs_encoder what FiLM sees of the observations goes through layers of their own first; the official code, on states, has none. A
+policy for PegInsertionSide takes far fewer gradient steps so (data/RESULTS.md).
+
 The sequence begins with the oldest observation of the window, so its first `window - 1` actions lie in the past. The last steps of
 sampling may have a network of their own: what DPPO fine-tunes (pdkit/rl/dppo.py), while the steps before them stay as imitated.
 """
 from __future__ import annotations
 
 import copy
+import itertools
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -74,13 +79,13 @@ class DiffusionPolicy(Policy):
     embed of the U-Net, diffusion_steps of training, prediction ("epsilon", "v_prediction"), sampler ("ddim", "ddpm"), sampler_steps,
     spacing (of DDIM's steps: "leading", "trailing"), late_steps (the last so many steps of sampling have a network of their own; 0: one
     for all), own_scale (the network's scale of observations is kept apart from the normaliser's: see `renormalise`), temperature (of the
-    noise that DDIM starts from), std_floor (of the normaliser), and action_limits (what is noised runs from -1 to 1 between the limits
-    of the demonstrated actions)."""
+    noise that DDIM starts from), std_floor (of the normaliser), action_limits (what is noised runs from -1 to 1 between the limits of
+    the demonstrated actions), and obs_encoder (widths of the layers between the observations and FiLM; [] for none)."""
 
     kind = "diffusion"
     defaults: dict[str, Any] = dict(window=2, horizon=16, chunk=4, dims=[64, 128, 256], kernel=5, groups=8, embed=64, diffusion_steps=100,
                                     prediction="epsilon", sampler="ddim", sampler_steps=4, spacing="leading", late_steps=0,
-                                    own_scale=False, temperature=1.0, std_floor=0.0, action_limits=False)
+                                    own_scale=False, temperature=1.0, std_floor=0.0, action_limits=False, obs_encoder=[])
     least = dict(embed=4, late_steps=0)
     made = ("late_steps", "own_scale")  # by DPPO, and by imitation from pictures
     recipe: dict[str, Any] = dict(lr=1e-4, beta1=0.95, weight_decay=1e-6, schedule="cosine", lr_warmup=500, ema_power=0.75)
@@ -101,12 +106,16 @@ class DiffusionPolicy(Policy):
                              f"and cosines, not {c['kernel']} and {c['embed']}.")
         if any(d % c["groups"] for d in c["dims"]):
             raise PdkitError(f"Diffusion Policy's dims {c['dims']} must be multiples of its groups ({c['groups']}).")
+        if any(type(width) is not int or width < 1 for width in c["obs_encoder"]):
+            raise PdkitError("Diffusion Policy's obs_encoder must be [] or a list of whole numbers of at least 1, not "
+                             f"{c['obs_encoder']}.")
         if not 1 <= c["sampler_steps"] <= c["diffusion_steps"]:
             raise PdkitError(f"sampler_steps must be from 1 to diffusion_steps ({c['diffusion_steps']}), not {c['sampler_steps']}.")
         self.normalizer = Normalizer(c["obs_dim"])
         self.scale = Normalizer(c["obs_dim"]) if c["own_scale"] else None
         self.limits = Limits(c["act_dim"]) if c["action_limits"] else None
-        self.unet = UNet(c["act_dim"], c["obs_dim"] * self.window, tuple(c["dims"]), c["kernel"], c["groups"], c["embed"])
+        self.obs_encoder = obs_layers(c["obs_dim"] * self.window, c["obs_encoder"]) if c["obs_encoder"] else None
+        self.unet = UNet(c["act_dim"], self.condition_dim, tuple(c["dims"]), c["kernel"], c["groups"], c["embed"])
         self.noise = _scheduler("ddpm", c)
         self.sampler = _scheduler(c["sampler"], c)
         if c["temperature"] != 1 and c["sampler"] != "ddim":
@@ -117,6 +126,11 @@ class DiffusionPolicy(Policy):
             raise PdkitError(f"late_steps, the steps with a network of their own, must be from 0 to all {self.sampling_steps} of the "
                              f"sampler's, not {c['late_steps']}.")
         self.late = copy.deepcopy(self.unet) if c["late_steps"] else None
+
+    @property
+    def condition_dim(self) -> int:
+        """How many numbers FiLM sees of the observations."""
+        return self.config["obs_encoder"][-1] if self.config["obs_encoder"] else self.config["obs_dim"] * self.window
 
     @property
     def sampling_steps(self) -> int:
@@ -143,12 +157,13 @@ class DiffusionPolicy(Policy):
         return sequences if self.limits is None else self.limits.off(sequences)
 
     def condition(self, windows: torch.Tensor) -> torch.Tensor:
-        """What the U-Net sees of windows (N, window, obs_dim): (N, window * obs_dim)."""
+        """What the U-Net sees of windows (N, window, obs_dim): (N, condition_dim)."""
         seen = self.normalizer(windows)
-        return (seen if self.scale is None else self.scale(seen)).flatten(1)
+        seen = (seen if self.scale is None else self.scale(seen)).flatten(1)
+        return seen if self.obs_encoder is None else self.obs_encoder(seen)
 
     def seen_scale(self) -> Normalizer:
-        """How the network sees observations, as one: the normaliser, with the network's own scale on top where there is one."""
+        """How the networks see observations, as one: the normaliser, with their own scale on top where there is one."""
         if self.scale is None:
             return self.normalizer
         both = Normalizer(self.config["obs_dim"]).to(self.normalizer.mean.device)
@@ -167,9 +182,9 @@ class DiffusionPolicy(Policy):
         self.scale.std.copy_(seen.std / self.normalizer.std)
 
     def film(self) -> nn.Linear:
-        """A copy of what turns an activated condition (N, window * obs_dim) into the scales and shifts of all blocks of the U-Net, as far
+        """A copy of what turns an activated condition (N, condition_dim) into the scales and shifts of all blocks of the U-Net, as far
         as they depend on the observations: what the diffusion step adds is the same for all."""
-        return self.unet.film(self.config["obs_dim"] * self.window)
+        return self.unet.film(self.condition_dim)
 
     def draw(self, shape: torch.Size) -> tuple[torch.Tensor, ...]:
         """Noise for the actions, and how many steps each sequence is noised by (B,)."""
@@ -206,6 +221,12 @@ class DiffusionPolicy(Policy):
 
     def parameter_groups(self, weight_decay: float) -> list[dict[str, Any]]:
         return [{"params": list(self.parameters()), "weight_decay": weight_decay}]
+
+
+def obs_layers(inputs: int, widths: Sequence[int]) -> nn.Sequential:
+    """Linear layers of these widths with Mish between them: (N, inputs) -> (N, widths[-1]). The blocks of the U-Net activate the last."""
+    sizes = itertools.pairwise((inputs, *widths))
+    return nn.Sequential(*[part for size in sizes for part in (nn.Linear(*size), nn.Mish())][:-1])
 
 
 def _scheduler(name: str, config: dict[str, Any]):

@@ -57,6 +57,7 @@ class VINN(Policy):
         self.normalizer = Normalizer(c["obs_dim"])
         self.gpt: nn.Module | None = trained.gpt if isinstance(trained, BeT) else None
         self.film: nn.Linear | None = trained.film() if isinstance(trained, DiffusionPolicy) else None
+        self.obs_encoder: nn.Module | None = trained.obs_encoder if isinstance(trained, DiffusionPolicy) else None
         if trained:
             seen = trained.seen_scale() if isinstance(trained, DiffusionPolicy) else trained.normalizer
             self.normalizer.load_state_dict(seen.state_dict())
@@ -108,7 +109,8 @@ class VINN(Policy):
         """phi (N, feature_dim) of windows (N, at least `looks`, obs_dim)."""
         seen = self.normalizer(windows[:, -self.looks:])
         if self.film is not None:
-            return self.film(F.mish(seen.flatten(1))).float()
+            flat = seen.flatten(1)
+            return self.film(F.mish(flat if self.obs_encoder is None else self.obs_encoder(flat))).float()
         return seen[:, -1, self.config["skip"]:] if self.gpt is None else self.gpt(seen)[:, -1].float()
 
     def _in_double(self) -> tuple[torch.Tensor, torch.Tensor]:
