@@ -41,7 +41,7 @@ def labels() -> dict[str, str]:
 
 def setups(task: str = "Door", profile: str = "lesson") -> pd.DataFrame:
     """One row a setup: setup, method, actor, offline data, online loss, offline share of online batches, offline updates, batch, updates a
-    step."""
+    step, steps of reward in a target."""
     rows = []
     for letter, method in SETUPS.items():
         c = method_config(method, task, profile)
@@ -51,7 +51,7 @@ def setups(task: str = "Door", profile: str = "lesson") -> pd.DataFrame:
             "actor": f"MLP, {c.sac.layers} x {c.sac.hidden}" if small else "BeT, imitated" if m.calql_pretrained else "GPT, random weights",
             "offline data": "demonstrations" + (f" and {m.calql_rollouts} rollouts" if m.calql_data == "mixed" else ""),
             "online": "Cal-QL" if m.calql_online == "calql" else "SAC", "offline share online": c.demo_fraction,
-            "offline updates": m.calql_offline_updates, "batch": c.batch, "updates a step": c.utd})
+            "offline updates": m.calql_offline_updates, "batch": c.batch, "updates a step": c.utd, "steps in a target": c.n_step})
     return pd.DataFrame(rows)
 
 

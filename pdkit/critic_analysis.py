@@ -35,6 +35,7 @@ from .torch_setup import autocast
 from .unlearning import drift, seconds, updates
 
 KINDS = {"mlp": "MLP", "shared": "shared transformer", "separate": "separate transformer"}
+TUNED = ("sac_finetune", "ppo_finetune")  # what the lesson compares them for
 NEVER = 10**9  # updates to wait
 assert tuple(KINDS) == CRITIC_BACKBONES
 

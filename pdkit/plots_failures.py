@@ -12,7 +12,7 @@ from .plots import COLORS, Picture, blank, styled
 from .stats import Rate
 
 ARMS = {"random critic": "#d1495b", "critic alone": "#e0a030", "critic learns": "#3c3c46",
-        "decorated, pushed": "#6aaed6", "decorated": COLORS["decorated"]}
+        "decorated, pushed": "#6aaed6", "decorated, no entropy": "#3fa7a0", "decorated": COLORS["decorated"]}
 OTHERS = ("#2c9f6b", "#8f5fb0", "#b07a3c", "#7d7d7d")  # for arms without a colour of their own
 
 

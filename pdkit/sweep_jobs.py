@@ -35,7 +35,8 @@ RECIPE = re.compile(r"[\w.,=+-]+")
 
 
 def make_jobs(spec: Spec) -> list[Job]:
-    """Every job, each checked as the command itself would: nothing runs before all are known to be right."""
+    """Every job, each checked by its names and configuration before any runs. What takes the loaded policy to tell (that it is none which
+    the method can start from, or that a setting does not suit the method) the job's own first second tells, and costs that job alone."""
     make = {"train": _training, "base": _imitation, "notebook": _notebook}[spec.kind]
     every = dict.fromkeys([*spec.seeds, *(seed for cell in spec.cells for seed in _seeds(spec, cell))])
     jobs = [make(spec, {name: value for name, value in cell.items() if name != "seeds"}, seed)

@@ -171,9 +171,20 @@ def test_fine_tuning_wants_a_policy_it_can_tune():
         run("sac_finetune", biased_base())
 
 
+@pytest.mark.parametrize("profile", ["lesson", "paper"])
+def test_nothing_of_the_decorator_holds_back_a_method_that_acts_by_itself(profile):
+    """On StackCube, whose lesson has a bound, one of the gripper's own, a gate and a penalty."""
+    held = method_config("policy_decorator", "StackCube", "lesson")
+    assert held.decorator.alpha < 1 and held.decorator.alpha_scale and held.decorator.H and held.sac.residual_penalty
+    free = set(METHODS) - {"policy_decorator", "ppo_decorator", "fish"}
+    for method in free:
+        c = method_config(method, "StackCube", profile)
+        found = c.decorator.alpha, tuple(c.decorator.alpha_scale), c.decorator.H, c.sac.residual_penalty
+        assert found == (1.0, (), 0, 0.0), method
+
+
 def test_residual_rl_is_the_decorator_without_bound_and_schedule():
-    config = method_config("residual_rl", "Door")
-    assert (config.decorator.alpha, config.decorator.H, config.warmup) == (1.0, 0, "uniform")
+    assert method_config("residual_rl", "Door").warmup == "uniform"
     trainer, policy = run("residual_rl", biased_base(), reach_demos(), total_steps=4000)
     assert type(trainer) is Trainer and success("reach", policy) > 0.9
 

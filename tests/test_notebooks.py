@@ -120,7 +120,8 @@ def test_unlearning(tmp_path):
     result = run("06", tmp_path, alpha=0.05)
     assert result["verdict"] in ("reproduced", "partly", "not") and result["updates"] == [2, 4]
     assert set(result["drift"]) == {"random critic", "critic alone", "critic learns", "decorated",
-                                    "decorated, pushed"}
+                                    "decorated, no entropy", "decorated, pushed"}
+    assert result["drift"]["decorated, no entropy"] != result["drift"]["decorated"]
     assert 0 < result["drift"]["decorated"] < result["drift"]["decorated, pushed"] <= result["bound"] == 0.05
     assert result["success"]["before"]["value"] <= 1 and result["exercise_solved"] is False
     assert (tmp_path / "success.png").exists() and not (tmp_path / "episode.png").exists()

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+import types
 from pathlib import Path
 
 import nbformat
@@ -552,6 +553,88 @@ def test_a_missing_ray_is_one_clear_sentence(tmp_path, monkeypatch, capsys, word
     assert cli.main(["sweep", str(written(tmp_path)), *words]) == 2
     assert capsys.readouterr().err == ("Ray is not installed; run `pip install ray`, or leave out --ray and --address to use local "
                                        "workers.\n")
+
+
+class FakeRay:
+    """What sweep_ray.py uses of Ray, so that it is tested where Ray is not installed; the real one: below."""
+
+    class exceptions:  # noqa: N801
+        RayError = type("RayError", (Exception,), {})
+        RayTaskError = type("RayTaskError", (RayError,), {})
+
+    def __init__(self, cpus=6.0, refuses=None):
+        self.cpus, self.refuses, self.calls = cpus, refuses, []
+
+    def init(self, **words):
+        self.calls.append(("init", words))
+        if self.refuses:
+            raise self.refuses
+
+    def cluster_resources(self):
+        return {"CPU": self.cpus}
+
+    def remote(self, **words):
+        self.calls.append(("remote", words))
+        return lambda function: types.SimpleNamespace(remote=lambda *given: (function, given))
+
+    def get(self, handle):
+        if isinstance(handle, Exception):
+            raise handle
+        return handle
+
+    def cancel(self, handle):
+        self.calls.append(("cancel", handle))
+
+    def wait(self, handles, **words):
+        self.calls.append(("wait", words))
+        raise self.exceptions.RayError("the cluster is gone")
+
+    def shutdown(self):
+        self.calls.append(("shutdown", None))
+
+
+@pytest.fixture
+def fake_ray(monkeypatch):
+    fake = FakeRay()
+    monkeypatch.setitem(sys.modules, "ray", fake)
+    monkeypatch.setattr(sweep_ray, "find_spec", lambda name: True)
+    monkeypatch.setenv("RAY_kill_child_processes_on_worker_exit_with_raylet_subreaper", "true")  # put back after the test
+    return fake
+
+
+def test_a_cluster_decides_how_many_jobs_run_and_no_job_is_tried_twice(fake_ray):
+    backend = sweep_ray.Ray("10.0.0.1:6379", None)
+    (_, asked), (_, task) = fake_ray.calls
+    assert backend.limit == 6 and asked["address"] == "10.0.0.1:6379" and "num_cpus" not in asked
+    assert asked["runtime_env"]["env_vars"]["PYTHONPATH"].startswith(str(sweep_ray.ROOT)) and task == {"num_cpus": 1, "max_retries": 0}
+    assert sweep_ray.Ray("10.0.0.1:6379", 3).limit == 3
+    assert sweep_ray.Ray(None, None).limit == 6 and fake_ray.calls[-2][1]["address"] == "local" and fake_ray.calls[-2][1]["num_cpus"] == 2
+    assert backend.start(play, "job") == (sweep_ray.work, (play, "job"))
+
+
+def test_a_cluster_that_is_not_there_is_one_sentence(fake_ray):
+    fake_ray.refuses = ConnectionError("no route to host.")
+    with pytest.raises(PdkitError, match=r"^Ray does not start at 10.0.0.1:1: .*no route to host\.$"):
+        sweep_ray.Ray("10.0.0.1:1", None)
+
+
+def test_what_became_of_a_job_on_ray(tmp_path, fake_ray):
+    backend, one = sweep_ray.Ray(None, 2), job(tmp_path, "a", value=3)
+    assert backend.problem({"row": {"value": 3}}, one) == "" and read_json(one.result) == {"row": {"value": 3}}
+    failed = FakeRay.exceptions.RayTaskError()
+    failed.cause = PdkitError("It broke; mend it.")
+    assert backend.problem(failed, one) == "It broke; mend it."
+    crashed = type("WorkerCrashedError", (FakeRay.exceptions.RayError,), {})()
+    assert backend.problem(crashed, one) == "its worker was lost (WorkerCrashedError)"
+    assert "JSON" in backend.problem({"row": object()}, one)
+
+
+def test_stopping_cancels_every_job_on_ray_and_shuts_it_down_even_if_it_does_not_answer(fake_ray):
+    backend = sweep_ray.Ray(None, 2)
+    del fake_ray.calls[:]
+    backend.stop(["a", "b"])
+    assert [name for name, _ in fake_ray.calls] == ["cancel", "cancel", "wait", "shutdown"]
+    assert fake_ray.calls[2][1] == {"num_returns": 2, "timeout": 10.0}
 
 
 def test_the_same_jobs_on_ray_fail_alone_too(tmp_path, monkeypatch):

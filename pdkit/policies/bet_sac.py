@@ -3,10 +3,10 @@
     u = atanh(scale * bin) + offset,   a = tanh(u) / scale
 
 Bins are k-means centres in the space of actions, as before; offsets live before the tanh, where SAC's Gaussian lives. `scale`
-keeps actions at the edge of their range, such as a closed gripper, away from atanh's poles: 0.3 for a ManiSkill gripper, 0.5
-for every Adroit joint. StackCube's shipped policies scale the arm, too, by 0.4: its demonstrated displacements reach that edge, and
-with the gripper's scale alone it solves next to nothing (data/results/bet_forms.csv). The mean is u at the likeliest bin; the spread
-comes from a head of its own, which imitation leaves alone (the paper does not say how it is made).
+keeps actions at the edge of their range, such as a closed gripper, away from atanh's poles: 0.3 for a ManiSkill gripper, 0.5 for every
+Adroit joint. Beyond 0.999 of the range (ours) atanh is cut off. StackCube's shipped policies scale the arm, too, by 0.4: its demonstrated
+displacements reach that edge, and with the gripper's scale alone it solves next to nothing (data/results/bet_forms.csv). The mean is u at
+the likeliest bin; the spread comes from a head of its own, which imitation leaves alone (the paper does not say how it is made).
 """
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from ..errors import PdkitError
 from ..tasks.spec import TaskSpec
 from .bet import BeT, focal_loss
 
-EDGE = 0.999  # actions are clipped to this share of their range before atanh
+EDGE = 0.999  # actions are clipped to this share of their range before atanh (ours; the paper's is not known)
 LOG_STD = (-5.0, 2.0)  # the range to which log_std is squashed, as the lesson's small actor does
 FIRST_LOG_STD = -3.0  # before any learning: a spread of 0.05; unknown in the paper
 

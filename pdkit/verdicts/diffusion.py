@@ -36,7 +36,7 @@ from ..claims import (
     signed,
     task_by_task,
 )
-from ..task_range import DIFFUSION
+from ..task_range import COLD, DIFFUSION
 from .registry import EIGHT, measures
 
 TUNED, KEPT = ("dipo",), ("residual_rl", "jsrl")  # the paper's baselines over Diffusion Policy
@@ -46,7 +46,8 @@ COLUMNS = ["task", "recipe", "seed", "base_success", "decorated_success"]
 
 def _recorded() -> tuple[list[str], pd.DataFrame, str]:
     """The records that tell anything; of the tasks on which the decorator has three seeds the rows of all methods that have as many
-    there, the decorator's cell under one name; and which cells these are, in words. Raises TooLittle where there are none."""
+    there, the decorator's cell under one name; and in words which cells these are, and which bases are none of the paper's kind. Raises
+    TooLittle where there are none."""
     tables, cells = {}, ""
     for record, own in DIFFUSION.items():
         with contextlib.suppress(TooLittle):
@@ -59,7 +60,9 @@ def _recorded() -> tuple[list[str], pd.DataFrame, str]:
                 cells += f"; on {' '.join(table.task.unique())} the decorator is {own}" * (own != DECORATOR)
     if not tables:
         raise TooLittle(f"Fewer than {LEAST_SEEDS} seeds of the decorator over a Diffusion Policy are recorded.")
-    return list(tables), pd.concat(tables.values(), ignore_index=True), cells
+    found = pd.concat(tables.values(), ignore_index=True)
+    cells += "".join(f"; {task}'s base starts from {share:g} of the noise" for task, share in COLD.items() if task in set(found.task))
+    return list(tables), found, cells
 
 
 @measures("Policy Decorator lifts Diffusion Policy bases")
