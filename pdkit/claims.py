@@ -10,8 +10,8 @@ Every verdict follows one of few rules, so that no one is tempted to choose the 
 - a claim of several parts is **reproduced** when all are, **not** when none is and one is "not", else **partly**; a statement with
   several conditions (such as "works") has the weakest verdict among them;
 - runs of several tasks, from one record or from those of a comparison on Door and on others (recorded.record_of), are judged by the mean
-  over the tasks; it is **partly** instead of reproduced where a task's own mean lies on the other side, and instead of not where a task's
-  whole interval lies on the side that the paper says (a mean on the right side that chance explains is no reason);
+  over the tasks; it is **partly** instead where a task by itself tells the contrary: of "reproduced" where its whole interval lies on the
+  other side, of "not" where it lies on the side that the paper says (a single task's mean that chance explains counts neither way);
 - where the claim names tasks, those of them that are recorded are judged alone, and the others told beside them; where it names more
   than were run, "reproduced" counts as **partly**;
 - fewer than three seeds are no test, and neither are two sides that both solve hardly anything: the budget does not tell them apart (of
@@ -127,9 +127,9 @@ def judged(interval: Interval, enough: float = 0.0) -> str:
 
 
 def judged_over_tasks(values: pd.Series, enough: float = 0.0) -> str:
-    """The rule above for values by (task, seed): that of their mean over tasks, but for what single tasks say against it."""
+    """The rule above for values by (task, seed): that of their mean over tasks, but for what single tasks tell against it."""
     verdict, own = judged(mean_interval(values), enough), [mean_interval(mine) for _, mine in values.groupby(level="task")]
-    if verdict == "reproduced" and any(interval.value <= enough for interval in own):
+    if verdict == "reproduced" and any(interval.high < enough for interval in own):
         return "partly"
     return "partly" if verdict == "not" and any(interval.low > enough for interval in own) else verdict
 

@@ -37,13 +37,17 @@ _PAPER_TASK: dict[str, dict[str, Any]] = {
 }
 
 # Over a Diffusion Policy, from the official script, which counts chunks as steps (facts.md 1.5, trap 1): `policy_values` turns these
-# counts into primitive steps. Over one that sees pictures the script has other values (batches of 256, bounds, H), which are not here.
+# counts into primitive steps.
 _PAPER_DIFFUSION: dict[str, Any] = dict(total_steps=4_000_000, warmup_steps=8_000, utd=0.25, alpha=0.1, H=100_000, eval_every=50_000,
                                         actor_lr=1e-4, critic_lr=1e-4)
 _PAPER_DIFFUSION_TASK: dict[str, dict[str, Any]] = {
     "PegInsertionSide": dict(H=30_000), "TurnFaucet": dict(total_steps=2_000_000),
     "PushChair": dict(total_steps=2_000_000, alpha=0.2, H=300_000, gamma=0.9),
 }
+# Over a policy that sees pictures, from the official script for those (facts.md 1.3, 1.4). It knows a Diffusion Policy alone and counts
+# chunks; over another policy the same counts are decisions, too. TurnFaucet's command has the defaults.
+_PAPER_VISUAL: dict[str, Any] = _PAPER_DIFFUSION | dict(total_steps=2_000_000, alpha=0.05, H=30_000, batch=256)
+_PAPER_VISUAL_TASK: dict[str, dict[str, Any]] = {"PushChair": dict(total_steps=5_000_000, alpha=0.2, H=100_000)}
 
 _LESSON: dict[str, Any] = {}  # the defaults of OnlineConfig, DecoratorConfig and SACConfig
 _LESSON_TASK: dict[str, dict[str, Any]] = {
@@ -100,14 +104,16 @@ def _like(task: str) -> str:
     return next((spec.name for spec in TASKS.values() if spec.demo_task == task), task)
 
 
-def policy_values(task: str, profile: str, kind: str, chunk: int) -> dict[str, Any]:
-    """What a profile sets otherwise, by flat name, over a base policy of this kind that decides on `chunk` actions at once.
+def policy_values(task: str, profile: str, kind: str, chunk: int, visual: bool = False) -> dict[str, Any]:
+    """What a profile sets otherwise, by flat name, over a base policy of this kind that decides on `chunk` actions at once, or is `visual`:
+    it sees pictures.
 
     A decision is then a chunk: discount and n-step return count decisions, and are chosen to look as far ahead in time as the
     task's own; the paper's budgets over a Diffusion Policy are chunks, ours primitive steps.
     """
-    if profile == "paper" and kind == "diffusion":
-        values = _PAPER_DIFFUSION | _PAPER_DIFFUSION_TASK.get(_like(task), {})
+    if profile == "paper" and (visual or kind == "diffusion"):
+        usual, of_task = (_PAPER_VISUAL, _PAPER_VISUAL_TASK) if visual else (_PAPER_DIFFUSION, _PAPER_DIFFUSION_TASK)
+        values = usual | of_task.get(_like(task), {})
         steps = {name: values[name] * chunk for name in ("total_steps", "warmup_steps", "H", "eval_every")}
         return values | steps | {"utd": values["utd"] / chunk}
     if chunk == 1 or profile == "paper":

@@ -12,7 +12,7 @@ from .cli import Parser
 from .errors import PdkitError
 from .files import ROOT, runs_root
 from .main_job import duration
-from .sweep_jobs import bases_to_make, finished, make_jobs, missing
+from .sweep_jobs import bases_to_make, finished, make_jobs, missing, unlike_recorded
 from .sweep_progress import Progress
 from .sweep_ray import Ray, must_be_installed
 from .sweep_run import LOG, Backend, Job, JobFunction, Local, run_job, run_jobs
@@ -120,6 +120,9 @@ def main(argv: list[str]) -> int:
     with _alone(spec.name):
         with contextlib.suppress(KeyboardInterrupt):
             baseless = _make(bases, jobs, args)
+            for base in unlike_recorded(spec, jobs):
+                print(f"{base} is made as the recorded runs' was, but its weights are not the same (another processor or library rounds "
+                      "otherwise): expect similar results, not the recorded ones.", flush=True)
             problems = baseless | _run([job for job in jobs if job.name not in baseless], args)
         if name:
             print(f"{record_results(name, jobs, command)} rows recorded in data/results/{name}.csv")

@@ -99,6 +99,12 @@ def is_made(base: str, spec: Spec) -> bool:
     return base not in spec.bases or (ROOT / base / "policy.json").exists()
 
 
+def unlike_recorded(spec: Spec, jobs: Sequence[Job]) -> list[str]:
+    """The base policies of these trainings that are there and have other weights than those behind the recorded rows, by folder."""
+    used = dict.fromkeys(base for job in jobs if (base := job.parameters.get("base")) in spec.checksums and is_made(base, spec))
+    return [base for base in used if read_card(ROOT / base)["weights_sha256"] != spec.checksums[base]]
+
+
 def bases_to_make(spec: Spec, jobs: Sequence[Job]) -> list[Job]:
     """The jobs that make the base policies which unfinished ones of these trainings need and which are not there.
 

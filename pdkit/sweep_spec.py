@@ -18,6 +18,7 @@ SPEC is a TOML (or JSON) file:
     [bases."runs/base/own"]   # optional: base policies that are not shipped, by the folder that cells name as `base`, with what
     task = "Door"             #   `kind = "base"` takes; a sweep that needs one that is not there makes it first
     policy = "diffusion"
+    sha256 = "ab12..."        #   optional: its weights' checksum where the recorded rows were made; a sweep tells where yours differs
 
 All cells run with the first seed, then all with the next: a sweep that is stopped early compares them on fewer seeds.
 
@@ -39,6 +40,7 @@ from .errors import PdkitError, unknown
 
 KINDS = ("train", "base", "notebook")
 NAME = re.compile(r"[\w.-]+")
+SHA256 = re.compile(r"[0-9a-f]{64}")
 OWN_BASE = re.compile(r"runs(/(?!\.)[\w.+-]+)+")
 KEYS = ("name", "kind", "seeds", "record", "minutes", "fixed", "grid", "cells", "bases")
 
@@ -55,6 +57,7 @@ class Spec:
     record: str = ""
     minutes: float | None = None
     bases: dict[str, dict[str, Any]] = field(default_factory=dict)  # by folder: what makes it
+    checksums: dict[str, str] = field(default_factory=dict)  # by folder: the weights' where the recorded rows were made, if known
 
 
 def load_spec(path: str | Path) -> Spec:
@@ -80,7 +83,7 @@ def load_spec(path: str | Path) -> Spec:
     for given in (seeds, *(cell["seeds"] for cell in cells if "seeds" in cell)):
         if not isinstance(given, list) or not given or any(type(s) is not int or s < 0 for s in given) or len(set(given)) < len(given):
             raise PdkitError(f"{path.name}: seeds must be different whole numbers of 0 or more, not {given!r}.")
-    bases = values.get("bases", {})
+    bases, checksums = values.get("bases", {}), {}
     for folder, base in bases.items():
         if values["kind"] != "train":
             raise PdkitError(f'{path.name}: bases are for kind = "train", not for {values["kind"]!r}; leave them out.')
@@ -88,7 +91,12 @@ def load_spec(path: str | Path) -> Spec:
             raise PdkitError(f'{path.name}: a base policy that a sweep makes lies below runs/, such as "runs/base/own", not in {folder!r}.')
         if not isinstance(base, dict) or "task" not in base or "recipe" in base:
             raise PdkitError(f"{path.name}: what makes {folder} is a table with a task, such as task = \"Door\", and without a recipe.")
-    return Spec(path, name, values["kind"], tuple(seeds), cells, values.get("record", ""), minutes, bases)
+        if "sha256" in base:
+            checksums[folder] = base["sha256"]
+            if not isinstance(base["sha256"], str) or not SHA256.fullmatch(base["sha256"]):
+                raise PdkitError(f"{path.name}: the sha256 of {folder} must be 64 hexadecimal digits, not {base['sha256']!r}.")
+    made = {folder: {key: value for key, value in base.items() if key != "sha256"} for folder, base in bases.items()}
+    return Spec(path, name, values["kind"], tuple(seeds), cells, values.get("record", ""), minutes, made, checksums)
 
 
 def _read(path: Path) -> dict[str, Any]:

@@ -8,6 +8,7 @@ learns), those runs stand for the task.
 from __future__ import annotations
 
 import contextlib
+import re
 
 import pandas as pd
 
@@ -47,9 +48,10 @@ def over_bets(jobs: pd.DataFrame, bets: pd.DataFrame) -> pd.DataFrame:
 def by_task(table: pd.DataFrame) -> pd.DataFrame:
     """A row for each of the paper's tasks, ManiSkill's first, from recorded rows of the main job.
 
-    Columns: task, suite, policy (kind of the base policy), demos (how many are bundled), label (who made them), seeds, episodes,
-    env_steps, base, base_low, base_high (Wilson over test episodes), decorated (mean over seeds), low, high (Student's t over seeds from
-    three on, else Wilson over the test episodes of the first seed), at_end (mean success at the last step). Not recorded: NaN.
+    Columns: task, suite, policy (kind of the base policy), demos (how many it learned from; where nothing is recorded, how many are
+    bundled), label (who made them), seeds, episodes, env_steps, base, base_low, base_high (Wilson over test episodes), decorated (mean over
+    seeds), low, high (Student's t over seeds from three on, else Wilson over the test episodes of the first seed), at_end (mean success at
+    the last step). Not recorded: NaN.
     """
     rows = []
     for suite in SUITES:
@@ -63,7 +65,7 @@ def by_task(table: pd.DataFrame) -> pd.DataFrame:
 def over_diffusion() -> pd.DataFrame:
     """The same for the tasks on which a Diffusion Policy was decorated: there it is the *last* policy that is tested, after fewer steps.
 
-    `demos` is how many are bundled, as there. Empty where nothing is recorded.
+    Empty where nothing is recorded.
     """
     rows = []
     for record, cell in DIFFUSION.items():
@@ -105,8 +107,10 @@ def _results(rows: pd.DataFrame) -> dict[str, object]:
     base = wilson(round(first.base_success * episodes), episodes)
     values = rows.set_index(["task", "seed"]).decorated_success
     interval = mean_interval(values) if len(rows) >= ENOUGH else wilson(round(first.decorated_success * episodes), episodes)
-    return {"policy": first.policy, "seeds": len(rows), "episodes": episodes, "env_steps": int(rows.env_steps.max()), "base": base.value,
-            "base_low": base.low, "base_high": base.high, "decorated": values.mean(), "low": max(interval.low, 0.0),
+    named = re.search(r"--num-demos (\d+)", str(first.get("command", "")))
+    own = {"demos": int(named[1])} if named else {}
+    return own | {"policy": first.policy, "seeds": len(rows), "episodes": episodes, "env_steps": int(rows.env_steps.max()),
+            "base": base.value, "base_low": base.low, "base_high": base.high, "decorated": values.mean(), "low": max(interval.low, 0.0),
             "high": min(interval.high, 1.0), "at_end": rows.decorated_success_at_end.mean()}
 
 

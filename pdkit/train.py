@@ -104,7 +104,7 @@ def _base(args) -> int:
     demos, settings = base_demos(args), parse_settings(args.set)
     shift, eyes = (settings.pop(name, None) if args.pixels else None for name in ("random_shift", "encoder"))
     if args.pixels:
-        check_pixels(args.policy, shift, eyes)
+        check_pixels(args.policy, shift, view_of(args.task), eyes)
     encoder = encoder_of(str(eyes)) if eyes is not None else None
     if eyes is not None and not encoder:
         raise PdkitError(f"There is no encoder in {eyes}; name the folder of a policy trained by `pdkit train base {args.task} --pixels`.")

@@ -1,4 +1,6 @@
 """Base policies that decide on several actions at once: steps stay primitive, a decision is one transition of the learner."""
+import types
+
 import numpy as np
 import pytest
 import torch
@@ -140,12 +142,31 @@ def test_methods_for_single_actions_say_so():
         reach_trainer("jsrl", TwoAtOnce(BIASED), eval_every=1000, eval_episodes=5)
 
 
+def test_the_factors_of_the_bound_are_counted_for_an_action_not_for_a_chunk():
+    with pytest.raises(PdkitError, match="alpha_scale has 3 factors; the action has 2 dimensions"):
+        reach_trainer("policy_decorator", TwoAtOnce(BIASED), alpha_scale=(1.0, 1.0, 0.5))
+
+
+def test_over_a_policy_that_sees_the_paper_profile_is_the_script_for_pictures():
+    def config(obs_dim):
+        sees = types.SimpleNamespace(kind="mlp", chunk=1, config={"obs_dim": obs_dim})
+        return method_config("policy_decorator", "TurnFaucet", "paper", policy=sees)
+
+    assert (config(288).batch, config(288).decorator.alpha, config(288).total_steps) == (256, 0.05, 2_000_000)
+    assert (config(40).batch, config(40).decorator.alpha, config(40).total_steps) == (1024, 0.2, 3_000_000)
+
+
 def test_the_papers_budgets_count_chunks_and_ours_primitive_steps():
     """facts.md 1.3 and 1.4: 4M chunks of 4 actions by default, TurnFaucet 2M, H 100,000 chunks, 0.25 updates a chunk."""
     paper = online_config("TurnFaucet", "paper", **policy_values("TurnFaucet", "paper", "diffusion", 4))
     assert (paper.total_steps, paper.decorator.H, paper.utd, paper.warmup_steps) == (8_000_000, 400_000, 0.0625, 32_000)
     chair = policy_values("PushChair", "paper", "diffusion", 4)
     assert (chair["alpha"], chair["H"], chair["gamma"]) == (0.2, 1_200_000, 0.9)
+    eyes = policy_values("TurnFaucet", "paper", "diffusion", 4, visual=True)  # the script for pictures
+    assert (eyes["total_steps"], eyes["H"], eyes["alpha"], eyes["batch"], eyes["utd"]) == (8_000_000, 120_000, 0.05, 256, 0.0625)
+    chair = policy_values("PushChairSource", "paper", "mlp", 1, visual=True)
+    assert (chair["total_steps"], chair["H"], chair["alpha"], chair["actor_lr"]) == (5_000_000, 100_000, 0.2, 1e-4)
+    assert policy_values("Door", "lesson", "mlp", 1, visual=True) == {}
     assert policy_values("TurnFaucet", "paper", "bet", 1) == policy_values("Door", "lesson", "diffusion", 1) == {}
     assert policy_values("StackCube", "lesson", "diffusion", 4) == {"gamma": 0.922, "n_step": 2}  # 0.98 and 5 a step
 

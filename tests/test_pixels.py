@@ -626,6 +626,7 @@ def test_figures_of_views_and_shifts():
     (["base", "Door", "--policy", "diffusion", "--pixels", "--set", "horizon=7"], "multiple of"),
     (["base", "Door", "--policy", "mlp", "--pixels", "--set", "random_shift=-1"], "whole number"),
     (["base", "Door", "--policy", "mlp", "--pixels", "--set", "random_shift=0.5"], "whole number"),
+    (["base", "PushChair", "--policy", "mlp", "--pixels", "--set", "random_shift=2"], "square pictures, not 50 x 125; set random_shift=0"),
     (["decorated", "Pen", "--pixels", "--base", str(DATA / "checkpoints" / "Door" / "pixels" / "base")], "robot of Door, not of Pen")])
 def test_a_bad_command_draws_nothing(monkeypatch, words, message):
     monkeypatch.setattr(train, "pictures_of", lambda *given: pytest.fail("pictures were drawn"))

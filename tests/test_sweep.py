@@ -250,6 +250,7 @@ def test_the_folder_follows_every_parameter_and_nothing_else(tmp_path):
     ({"cells": [{"alpha": 0.2, "recipe": "alpha=0.1"}]}, "are called the same"),
     ({"bases": {"data/own": {"task": "Door"}}}, "a base policy that a sweep makes lies below runs/"),
     ({"bases": {"runs/../own": {"task": "Door"}}}, "not in 'runs/../own'"),
+    ({"bases": {"runs/base/own": {"task": "Door", "sha256": "12"}}}, "the sha256 of runs/base/own must be 64 hexadecimal digits, not '12'"),
     ({"bases": {"runs/base/own": 3}}, "what makes runs/base/own is a table with a task"),
     (BASE | {"bases": {"runs/base/own": {"task": "Door"}}}, "bases are for kind = \"train\", not for 'base'; leave them out"),
     (UNMADE | {"bases": {"runs/none/own": {"policy": "mlp"}}}, "what makes runs/none/own is a table with a task"),
@@ -519,6 +520,10 @@ def test_a_base_policy_that_is_not_there_is_made_first(tmp_path, results, capsys
     assert row.policy == "mlp" and f"--base {own_base} " in row.command
     assert sweep_jobs.make_jobs(load_spec(path))[0].config["base"] == card["weights_sha256"]
     assert cli.main(words) == 0 and "base policies" not in capsys.readouterr().out
+    for sha, told in ((card["weights_sha256"], False), ("0" * 64, True)):
+        written(tmp_path, grid=None, cells=[{"recipe": "over", "base": own_base}], bases={own_base: made | {"sha256": sha}})
+        assert cli.main(words) == 0 and ("its weights are not the same" in capsys.readouterr().out) == told  # and nothing runs anew
+    assert sweep_jobs.make_jobs(load_spec(path))[0].name == one.name
     shutil.rmtree(one.folder)
     written(tmp_path, grid=None, cells=[{"recipe": "over", "base": own_base}], bases={own_base: made | {"lr": 0.5, "policy": "cnn"}})
     assert cli.main(words) == 2  # the policy that is there is not the one that the spec describes now

@@ -10,7 +10,8 @@ from pdkit.stats import wilson
 @pytest.fixture
 def tasks():
     rows = [dict(task="Door", policy="bet", seed=seed, episodes=200, env_steps=1000 + seed, base_success=0.5, decorated_success=end,
-                 decorated_success_at_end=end - 0.1) for seed, end in enumerate((0.9, 0.95, 1.0))]
+                 decorated_success_at_end=end - 0.1, command="pdkit train decorated Door --num-demos 5")
+            for seed, end in enumerate((0.9, 0.95, 1.0))]
     rows.append(dict(task="StackCube", policy="mlp", seed=0, episodes=100, env_steps=60, base_success=0.4, decorated_success=0.8,
                      decorated_success_at_end=0.3))
     return task_range.by_task(pd.DataFrame(rows))
@@ -25,6 +26,7 @@ def test_every_task_of_the_paper_has_a_row(tasks):
     one = wilson(80, 100)
     assert (known.loc["StackCube", "low"], known.loc["StackCube", "high"]) == (one.low, one.high)  # one seed: its test episodes' alone
     assert known.loc["Pen", "seeds"] == 0 and np.isnan(known.loc["Pen", "decorated"]) and known.loc["Pen", "demos"] == 25
+    assert known.loc["Door", "demos"] == 5  # of 25: what the base policy of these runs learned from
     assert known.loc["TurnFaucet", "label"] == "scripted, other objects" and known.loc["Pen", "label"] == "agent"
 
 

@@ -15,6 +15,7 @@ from . import sources
 from .experts import EXPERTS
 from .format import Demos, load_demos, save_demos
 
+LAST_SEED = 4_000_000_000  # of a first episode: simulators take 32 bits, and the next episodes' seeds must fit, too
 SOURCES = ("scripted", "agent", "human", "hub")
 
 
@@ -46,6 +47,9 @@ def main(argv: list[str]) -> int:
         raise PdkitError("Name a task, for example `pdkit demos StackCube --num 1000`, or use --list.")
     if args.num < 1:
         raise PdkitError(f"--num must be at least 1, not {args.num}.")
+    for name, value, most in (("--first-seed", args.first_seed, LAST_SEED), ("--noise", args.noise, 10.0), ("--tail", args.tail, 10_000)):
+        if value is not None and not 0 <= value <= most:
+            raise PdkitError(f"{name} must be from 0 to {most:,}, not {value}.")
     get_task(args.task)
     source = args.source or ("scripted" if args.task in EXPERTS else "agent")
     if args.file and source != "hub":

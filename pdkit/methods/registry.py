@@ -30,8 +30,9 @@ def method_config(method: str, task: str, profile: str = "lesson", seed: int = 0
     in its chunks, then the method's changes, then `changes` (flat names)."""
     m = get_method(method)
     own = m.changes | {"lesson": m.lesson, "smoke": m.lesson, "paper": m.paper}.get(profile, {})
-    over = policy_values(task, profile, policy.kind, policy.chunk) if policy is not None and trainer_of(method).chunks else {}
     sees_state = policy is None or policy.config["obs_dim"] == get_task(task).obs_dim  # and not what an encoder makes of pictures
+    chunks = policy is not None and trainer_of(method).chunks
+    over = policy_values(task, profile, policy.kind, policy.chunk, not sees_state) if chunks else {}
     over |= {} if trainer_of(method).sees_features and sees_state else {"features": False}
     return online_config(task, profile, seed, **({"method": method} | over | own | changes))
 

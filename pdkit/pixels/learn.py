@@ -92,9 +92,10 @@ def look_up(demos: Demos, pictures: Pictures, encoder: Encoder, config: ImitateC
     return imitate("vinn", seen, config, policy_config, progress=progress, spec=pixel_spec(spec or get_task(demos.task), encoder))
 
 
-def check_pixels(kind: str, shift: Any, encoder: Any = None) -> None:
-    """Raises PdkitError for a kind of policy that cannot see, a shift (None: the view's) that is no whole number from 0 on, and for an
-    encoder (a folder) that is given to a policy which trains its own, or not to VINN, which has none."""
+def check_pixels(kind: str, shift: Any, view: View, encoder: Any = None) -> None:
+    """Raises PdkitError for a kind of policy that cannot see, a shift (None: the view's) that is no whole number from 0 on or that pictures
+    of this view cannot have, and for an encoder (a folder) that is given to a policy which trains its own, or not to VINN, which has none.
+    """
     if kind not in (*HEADS, "vinn"):
         raise PdkitError(f"Policies that see pictures are of the kinds {', '.join(HEADS)} and vinn, not {kind}.")
     if (kind == "vinn") != (encoder is not None):
@@ -103,6 +104,8 @@ def check_pixels(kind: str, shift: Any, encoder: Any = None) -> None:
     if kind == "vinn" and shift is not None:
         raise PdkitError("VINN trains nothing that a random_shift could help; leave it out.")
     _check_shift(shift)
+    if shift and view.height != view.width:
+        raise PdkitError(f"Random shift is for square pictures, not {view.height} x {view.width}; set random_shift=0.")
 
 
 def _check_shift(shift: Any) -> None:
