@@ -122,17 +122,22 @@ def sampling_figure(table: pd.DataFrame, title: str = "") -> Picture:
 
 @styled
 def temperature_figure(table: pd.DataFrame) -> Picture:
-    """Success against how much noise sampling starts from, a panel a task. Rows of `task_range.by_temperature`."""
+    """Success against how much noise sampling starts from, a panel a task, at most four a row. Rows of `task_range.by_temperature`."""
     tasks = list(dict.fromkeys(table.task))
-    figure, axes = blank(1, len(tasks), (1.6 * len(tasks), 2.6), sharey=True)
-    for ax, task, color in zip(axes[0], tasks, PALETTE, strict=False):
+    columns = min(len(tasks), 4)
+    lines = -(-len(tasks) // columns)
+    figure, axes = blank(lines, columns, (2.3 * columns, 2.3 * lines), sharey=True)
+    for ax in axes.flat[len(tasks):]:
+        ax.remove()
+    for ax, task, color in zip(axes.flat, tasks, PALETTE, strict=False):
         rows = table[table.task == task]
         errors = np.stack([rows.success - rows.low, rows.high - rows.success])
         ax.errorbar(rows.temperature, rows.success, errors, color=color, marker="o", ms=5, lw=1.6, capsize=2)
-        ax.set(title=task, xlim=(-0.15, table.temperature.max() + 0.15), ylim=(-0.02, 1.04), xlabel="temperature")
+        ax.set(title=task, xlim=(-0.15, table.temperature.max() + 0.15), ylim=(-0.02, 1.04))
         ax.set_xticks(sorted(rows.temperature))
         ax.yaxis.set_major_formatter(mpl.ticker.PercentFormatter(1.0, decimals=0))
-    axes[0, 0].set_ylabel(f"success, {table.episodes.iloc[0]} episodes")
+    figure.supxlabel("temperature")
+    figure.supylabel(f"success, {table.episodes.iloc[0]} episodes")
     return figure
 
 
