@@ -76,8 +76,8 @@ def _() -> Finding:
     not judged: the same with targets of one step of reward, as the original has (here five), added after a first result."""
     interval, values, told = _efficiency("calql_a", "calql_b")
     with contextlib.suppress(TooLittle):
-        _, one, beside = _efficiency("calql_a,n_step=1", "calql_b,n_step=1")
-        told += f"; not judged: with targets of one step ({' '.join(one.index.unique('task'))}) {beside}"
+        one, runs, beside = _efficiency("calql_a,n_step=1", "calql_b,n_step=1")
+        told += f"; not judged: with targets of one step ({' '.join(runs.index.unique('task'))}) {beside}, a difference of {points(one)}"
     return finding("calql", values, f"A and B: {told}", points(interval), judged_over_tasks(values, 0.1))
 
 
