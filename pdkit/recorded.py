@@ -141,7 +141,10 @@ def _merged(path: Path, new: pd.DataFrame) -> pd.DataFrame:
         old = pd.read_csv(path)
         mine = new[KEYS].drop_duplicates()
         old = old.merge(mine, on=KEYS, how="left", indicator=True).query("_merge == 'left_only'").drop(columns="_merge")
-        new = pd.concat([old, new], ignore_index=True)
+        columns = list(dict.fromkeys([*old, *new]))
+        # Columns without a value say nothing of their type, and pandas is about to let them decide it.
+        parts = [part.dropna(axis=1, how="all") for part in (old, new) if len(part)]
+        new = pd.concat(parts, ignore_index=True).reindex(columns=columns)
     return new.sort_values([*KEYS, *(["step"] if "step" in new else [])], ignore_index=True)
 
 
