@@ -22,7 +22,7 @@ Not as in the original: demonstrations are cut at their first success (there: th
 drops offline trajectories without a reward, of experts and of the cloned policy alike; F.3 counts on them), and both networks have the
 same size. The lesson profile is what the other methods' is, and no setup's the original's: targets of five steps of reward, uncorrected
 for who took them (there one; calql.toml has A and B with one, too), a gamma of 0.97 or 0.98, critics with LayerNorm, an averaged actor,
-in A to C learning rates of 6e-4 and 1e-3, and 0.01 as the first temperature.
+other learning rates, and 0.01 as the first temperature.
 """
 from __future__ import annotations
 

@@ -46,8 +46,8 @@ COLUMNS = ["task", "recipe", "seed", "base_success", "decorated_success"]
 
 def _recorded() -> tuple[list[str], pd.DataFrame, str]:
     """The records that tell anything; of the tasks on which the decorator has three seeds the rows of all methods that have as many
-    there, the decorator's cell under one name; and in words which cells these are, and which bases are none of the paper's kind. Raises
-    TooLittle where there are none."""
+    there, the decorator's cell under one name; and in words which cells these are. Raises TooLittle where
+    there are none."""
     tables, cells = {}, ""
     for record, own in DIFFUSION.items():
         with contextlib.suppress(TooLittle):
@@ -61,8 +61,13 @@ def _recorded() -> tuple[list[str], pd.DataFrame, str]:
     if not tables:
         raise TooLittle(f"Fewer than {LEAST_SEEDS} seeds of the decorator over a Diffusion Policy are recorded.")
     found = pd.concat(tables.values(), ignore_index=True)
-    cells += "".join(f"; {task}'s base starts from {share:g} of the noise" for task, share in COLD.items() if task in set(found.task))
     return list(tables), found, cells
+
+
+def _cold(found: Finding) -> Finding:
+    """With what is told of those of its bases that are none of the paper's kind."""
+    told = "".join(f"; {task}'s base starts from {share:g} of the noise" for task, share in COLD.items() if task in found.tasks.split())
+    return replace(found, measured=found.measured + told)
 
 
 @measures("Policy Decorator lifts Diffusion Policy bases")
@@ -71,16 +76,16 @@ def _() -> Finding:
     records, table, cells = _recorded()
     end, start = (by_seed(table, DECORATOR, column) for column in ("decorated_success", "base_success"))
     gain, values = difference(end, start)
-    return finding(records, values, f"{percent(average(start))} to {percent(average(end))}: {signed(gain.value)} points"
+    return _cold(finding(records, values, f"{percent(average(start))} to {percent(average(end))}: {signed(gain.value)} points"
                    f"{task_by_task(values, signed)}{cells}", points(gain),
-                   jointly(judged_over_tasks(values), judged(mean_interval(end), NEARLY)), EIGHT)
+                   jointly(judged_over_tasks(values), judged(mean_interval(end), NEARLY)), EIGHT))
 
 
 @measures("With Diffusion Policy bases, Policy Decorator")
 def _() -> Finding:
     """Ahead of the best of both kinds; the interval is that of the smaller lead."""
     records, table, cells = _recorded()
-    return ahead(records, table, DECORATOR, {"no fine-tuning": KEPT, "fine-tuning": TUNED}, EIGHT, cells + besides(table, BESIDES))
+    return _cold(ahead(records, table, DECORATOR, {"no fine-tuning": KEPT, "fine-tuning": TUNED}, EIGHT, cells + besides(table, BESIDES)))
 
 
 @measures("The best baseline that fine-tunes Diffusion Policy")
