@@ -58,6 +58,12 @@ class DecoratorConfig:
         return obs_dim + act_dim * (1 if self.actor_input == "obs+base" else 0)
 
 
+def check_scale(config: DecoratorConfig, act_dim: int) -> None:
+    """Raises PdkitError when alpha_scale does not fit an action of so many dimensions."""
+    if len(config.alpha_scale) not in (0, act_dim):
+        raise PdkitError(f"alpha_scale has {len(config.alpha_scale)} factors; the action has {act_dim} dimensions.")
+
+
 def scaled(config: DecoratorConfig, residual):
     """alpha * a_res: what is added to the base action. A tensor or an array (..., act_dim), as the residual is.
 
@@ -65,8 +71,7 @@ def scaled(config: DecoratorConfig, residual):
     """
     if not config.alpha_scale:
         return config.alpha * residual
-    if len(config.alpha_scale) != residual.shape[-1]:
-        raise PdkitError(f"alpha_scale has {len(config.alpha_scale)} factors; the action has {residual.shape[-1]} dimensions.")
+    check_scale(config, residual.shape[-1])
     if isinstance(residual, torch.Tensor):
         return residual * _factors(config, residual.device, residual.dtype)
     return residual * _factors(config, None, residual.dtype)

@@ -17,7 +17,7 @@ import torch
 from torch import nn
 
 from .decorated import Decorated, flat_actions, save_decorated
-from .decorator import compose, gate, gate_probability, scaled
+from .decorator import check_scale, compose, gate, gate_probability, scaled
 from .demos.format import Demos
 from .errors import PdkitError
 from .online_config import OnlineConfig, decision_reward, lr_factor, stops
@@ -42,8 +42,7 @@ class Trainer:
 
     def __init__(self, config: OnlineConfig, base: Policy, demos: Demos | None = None, spec: TaskSpec | None = None):
         pick_device(config.device)  # an error where it is not there
-        if (given := len(config.decorator.alpha_scale)) not in (0, base.config["act_dim"]):
-            raise PdkitError(f"alpha_scale has {given} factors; the action has {base.config['act_dim']} dimensions.")
+        check_scale(config.decorator, base.config["act_dim"])
         # The factors of alpha hold for each action of a chunk.
         decorator = dataclasses.replace(config.decorator, alpha_scale=config.decorator.alpha_scale * base.chunk)
         self.config, self.base = dataclasses.replace(config, decorator=decorator), base.eval().to(config.device)

@@ -98,10 +98,10 @@ def refuse_to_replace(name: str, tasks: Sequence[str], recipes: Sequence[str], f
 
     A row is known by its task and recipe, which do not tell two policies of one kind apart: recording would replace the other's.
     """
-    path = recorded.DATA / "results" / f"{name}.csv"
-    if not path.exists():
+    try:
+        rows, _ = recorded.load(name)
+    except PdkitError:  # nothing is recorded
         return
-    rows = recorded.of_these_objects(pd.read_csv(path))
     for row in rows[rows.task.isin(tasks) & rows.recipe.isin(recipes)].itertuples():
         holder = str(row.command).removeprefix("pdkit evaluate ").partition(" --tasks ")[0]
         if Path(holder).resolve() != Path(folder).resolve():
@@ -113,8 +113,9 @@ def corrected(kind: str, policy: Policy | Decorated, args: argparse.Namespace) -
     """`pdkit evaluate --oracle`: success by the bound (pdkit/oracle.py), printed, and recorded if asked, a row a task and bound."""
     if kind != "base" or encoder_of(args.policy):
         raise PdkitError("--oracle corrects a base policy that is told the state; name the folder of one.")
+    named = [f"{policy.kind},alpha={alpha:g}" for alpha in args.oracle]
     if args.record:
-        refuse_to_replace(args.record, args.tasks, [f"{policy.kind},alpha={alpha:g}" for alpha in args.oracle], args.policy)
+        refuse_to_replace(args.record, args.tasks, named, args.policy)
     for task in args.tasks:
         rows = by_bound(get_task(task), policy, args.oracle, reported_seeds(args.episodes),
                         Progress(args.episodes * len(args.oracle), "episodes"))
@@ -123,7 +124,6 @@ def corrected(kind: str, policy: Policy | Decorated, args: argparse.Namespace) -
         if args.record:
             again = [f"pdkit evaluate {args.policy} --tasks {task} --episodes {args.episodes} --oracle {alpha:g} --record {args.record}"
                      for alpha in rows.alpha]
-            named = [f"{policy.kind},alpha={alpha:g}" for alpha in rows.alpha]
             recorded.record(args.record, rows.assign(policy=policy.kind, recipe=named, seed=0, command=again), pd.DataFrame())
     return 0
 

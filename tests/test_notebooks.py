@@ -121,7 +121,7 @@ def test_unlearning(tmp_path):
     assert result["verdict"] in ("reproduced", "partly", "not") and result["updates"] == [2, 4]
     assert set(result["drift"]) == {"random critic", "critic alone", "critic learns", "decorated",
                                     "decorated, no entropy", "decorated, pushed"}
-    assert result["drift"]["decorated, no entropy"] != result["drift"]["decorated"]
+    assert result["drift"]["decorated"] < result["drift"]["decorated, no entropy"] < result["drift"]["decorated, pushed"]
     assert 0 < result["drift"]["decorated"] < result["drift"]["decorated, pushed"] <= result["bound"] == 0.05
     assert result["success"]["before"]["value"] <= 1 and result["exercise_solved"] is False
     assert (tmp_path / "success.png").exists() and not (tmp_path / "episode.png").exists()

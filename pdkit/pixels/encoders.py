@@ -83,6 +83,12 @@ class Encoder(nn.Module):
         return torch.cat(parts).float().numpy()
 
 
+def check_square(height: int, width: int) -> None:
+    """Raises PdkitError for pictures that `random_shift` cannot move."""
+    if height != width:
+        raise PdkitError(f"Random shift is for square pictures, not {height} x {width}; set random_shift=0.")
+
+
 def random_shift(pictures: torch.Tensor, pad: int, generator: torch.Generator) -> torch.Tensor:
     """Pictures (B, C, H, W), each moved by whole pixels, up to `pad` in either direction; what is bared repeats the edge.
 
@@ -90,8 +96,7 @@ def random_shift(pictures: torch.Tensor, pad: int, generator: torch.Generator) -
     paper's code: raises PdkitError for others.
     """
     batch, _, height, width = pictures.shape
-    if height != width:
-        raise PdkitError(f"Random shift is for square pictures, not {height} x {width}; set random_shift=0.")
+    check_square(height, width)
     moves = torch.randint(-pad, pad + 1, (batch, 2, 1), generator=generator).to(pictures.device)
     along, each = (torch.arange(count, device=pictures.device) for count in (height, batch))
     rows, columns = ((along + moves[:, axis]).clamp(0, height - 1) for axis in (0, 1))

@@ -24,7 +24,7 @@ from ..policies import MLP, POLICIES, BeT, DiffusionPolicy, Policy
 from ..tasks import get_task
 from ..tasks.spec import TaskSpec
 from .cameras import View, view_of
-from .encoders import FEATURES, Encoder, random_shift
+from .encoders import FEATURES, Encoder, check_square, random_shift
 from .pictures import Pictures, encoded
 from .task import pixel_spec
 
@@ -43,8 +43,8 @@ def imitate_pixels(kind: str, demos: Demos, pictures: Pictures, config: ImitateC
     """
     if kind not in HEADS:
         raise PdkitError(f"An encoder is trained together with {', '.join(HEADS[:-1])} or {HEADS[-1]}, not {kind}.")
-    _check_shift(shift)
     view, spec = view or view_of(demos.task), spec or get_task(demos.task)
+    _check_shift(shift, view)
     shift = view.shift if shift is None else shift
     torch.manual_seed(config.seed)
     generator = torch.Generator().manual_seed(config.seed)
@@ -103,14 +103,14 @@ def check_pixels(kind: str, shift: Any, view: View, encoder: Any = None) -> None
                          else f"A policy of kind {kind} trains its own encoder; encoder=FOLDER is for vinn.")
     if kind == "vinn" and shift is not None:
         raise PdkitError("VINN trains nothing that a random_shift could help; leave it out.")
-    _check_shift(shift)
-    if shift and view.height != view.width:
-        raise PdkitError(f"Random shift is for square pictures, not {view.height} x {view.width}; set random_shift=0.")
+    _check_shift(shift, view)
 
 
-def _check_shift(shift: Any) -> None:
+def _check_shift(shift: Any, view: View) -> None:
     if shift is not None and (type(shift) is not int or shift < 0):
         raise PdkitError(f"random_shift counts pixels: it must be a whole number from 0 on, not {shift!r}.")
+    if shift:
+        check_square(view.height, view.width)
 
 
 def visual_settings(kind: str, view: View, spec: TaskSpec) -> dict[str, Any]:

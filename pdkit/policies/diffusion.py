@@ -114,7 +114,7 @@ class DiffusionPolicy(Policy):
         self.normalizer = Normalizer(c["obs_dim"])
         self.scale = Normalizer(c["obs_dim"]) if c["own_scale"] else None
         self.limits = Limits(c["act_dim"]) if c["action_limits"] else None
-        self.obs_encoder = obs_layers(c["obs_dim"] * self.window, c["obs_encoder"]) if c["obs_encoder"] else None
+        self.obs_encoder = obs_layers(c["obs_dim"] * self.window, c["obs_encoder"])
         self.unet = UNet(c["act_dim"], self.condition_dim, tuple(c["dims"]), c["kernel"], c["groups"], c["embed"])
         self.noise = _scheduler("ddpm", c)
         self.sampler = _scheduler(c["sampler"], c)
@@ -130,7 +130,7 @@ class DiffusionPolicy(Policy):
     @property
     def condition_dim(self) -> int:
         """How many numbers FiLM sees of the observations."""
-        return self.config["obs_encoder"][-1] if self.config["obs_encoder"] else self.config["obs_dim"] * self.window
+        return (self.config["obs_dim"] * self.window, *self.config["obs_encoder"])[-1]
 
     @property
     def sampling_steps(self) -> int:
@@ -159,8 +159,7 @@ class DiffusionPolicy(Policy):
     def condition(self, windows: torch.Tensor) -> torch.Tensor:
         """What the U-Net sees of windows (N, window, obs_dim): (N, condition_dim)."""
         seen = self.normalizer(windows)
-        seen = (seen if self.scale is None else self.scale(seen)).flatten(1)
-        return seen if self.obs_encoder is None else self.obs_encoder(seen)
+        return self.obs_encoder((seen if self.scale is None else self.scale(seen)).flatten(1))
 
     def seen_scale(self) -> Normalizer:
         """How the networks see observations, as one: the normaliser, with their own scale on top where there is one."""
@@ -224,7 +223,8 @@ class DiffusionPolicy(Policy):
 
 
 def obs_layers(inputs: int, widths: Sequence[int]) -> nn.Sequential:
-    """Linear layers of these widths with Mish between them: (N, inputs) -> (N, widths[-1]). The blocks of the U-Net activate the last."""
+    """Linear layers of these widths with Mish between them: (N, inputs) -> (N, widths[-1]); without widths what is given. The blocks of
+    the U-Net activate the last."""
     sizes = itertools.pairwise((inputs, *widths))
     return nn.Sequential(*[part for size in sizes for part in (nn.Linear(*size), nn.Mish())][:-1])
 

@@ -2,11 +2,11 @@
 
     d_i = |phi(o) - phi(o_i)|,   a = sum_i softmax(-d)_i a_i   over the k nearest observations o_i of the demonstrations
 
-phi is the normalised observation ("raw"); or what the GPT of a trained Behavior Transformer makes of the window, at its last position;
-or the scales and shifts by which the observations steer all blocks of a trained Diffusion Policy's U-Net (FiLM; the paper does not say
-which of them, ours are all: they are the same at each diffusion step up to a constant, which distances do not see). `skip` hides the
-first numbers of raw observations from the lookup: beside the features of a picture these are the robot's state, and without them it is
-by the picture alone (Table 13; pdkit/pixels/learn.py makes such observations).
+phi is the normalised observation ("raw"); or what the GPT of a trained Behavior Transformer makes of the window, at its last position; or
+the scales and shifts by which the observations steer all blocks of a trained Diffusion Policy's U-Net (FiLM, through the layers that it has
+for observations; the paper does not say which blocks, ours are all: they are the same at each diffusion step up to a constant, which
+distances do not see). `skip` hides the first numbers of raw observations from the lookup: beside the features of a picture these are the
+robot's state, and without them it is by the picture alone (Table 13; pdkit/pixels/learn.py makes such observations).
 
 k = 1 copies the nearest action, as FISH does. `exclusion` adds FISH's buffer against getting stuck: a neighbour that comes up for more
 than the `tolerance`-th time is passed over for the next nearest, and stays out until `exclusion` others have been put out after it (FISH:
@@ -109,8 +109,7 @@ class VINN(Policy):
         """phi (N, feature_dim) of windows (N, at least `looks`, obs_dim)."""
         seen = self.normalizer(windows[:, -self.looks:])
         if self.film is not None:
-            flat = seen.flatten(1)
-            return self.film(F.mish(flat if self.obs_encoder is None else self.obs_encoder(flat))).float()
+            return self.film(F.mish(self.obs_encoder(seen.flatten(1)))).float()
         return seen[:, -1, self.config["skip"]:] if self.gpt is None else self.gpt(seen)[:, -1].float()
 
     def _in_double(self) -> tuple[torch.Tensor, torch.Tensor]:

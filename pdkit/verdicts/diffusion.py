@@ -46,8 +46,8 @@ COLUMNS = ["task", "recipe", "seed", "base_success", "decorated_success"]
 
 def _recorded() -> tuple[list[str], pd.DataFrame, str]:
     """The records that tell anything; of the tasks on which the decorator has three seeds the rows of all methods that have as many
-    there, the decorator's cell under one name; and in words which cells these are. Raises TooLittle where
-    there are none."""
+    there, the decorator's cell under one name; and in words which cells these are. Raises TooLittle where there are none.
+    """
     tables, cells = {}, ""
     for record, own in DIFFUSION.items():
         with contextlib.suppress(TooLittle):
@@ -60,8 +60,7 @@ def _recorded() -> tuple[list[str], pd.DataFrame, str]:
                 cells += f"; on {' '.join(table.task.unique())} the decorator is {own}" * (own != DECORATOR)
     if not tables:
         raise TooLittle(f"Fewer than {LEAST_SEEDS} seeds of the decorator over a Diffusion Policy are recorded.")
-    found = pd.concat(tables.values(), ignore_index=True)
-    return list(tables), found, cells
+    return list(tables), pd.concat(tables.values(), ignore_index=True), cells
 
 
 def _cold(found: Finding) -> Finding:
@@ -76,9 +75,9 @@ def _() -> Finding:
     records, table, cells = _recorded()
     end, start = (by_seed(table, DECORATOR, column) for column in ("decorated_success", "base_success"))
     gain, values = difference(end, start)
-    return _cold(finding(records, values, f"{percent(average(start))} to {percent(average(end))}: {signed(gain.value)} points"
-                   f"{task_by_task(values, signed)}{cells}", points(gain),
-                   jointly(judged_over_tasks(values), judged(mean_interval(end), NEARLY)), EIGHT))
+    told = f"{percent(average(start))} to {percent(average(end))}: {signed(gain.value)} points{task_by_task(values, signed)}{cells}"
+    verdict = jointly(judged_over_tasks(values), judged(mean_interval(end), NEARLY))
+    return _cold(finding(records, values, told, points(gain), verdict, EIGHT))
 
 
 @measures("With Diffusion Policy bases, Policy Decorator")
