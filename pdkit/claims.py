@@ -71,7 +71,8 @@ def by_seed(table: pd.DataFrame, recipe: str, column: str) -> pd.Series:
         raise TooLittle(f"No column {column} is recorded.")
     values = _of_enough_seeds(table[table.recipe == recipe].set_index(["task", "seed"])[column].dropna())
     if values.empty:
-        raise TooLittle(f"Fewer than {LEAST_SEEDS} seeds of {recipe} are recorded.")
+        where = " on an undisturbed machine" if column == "train_minutes" else ""  # see `undisturbed`
+        raise TooLittle(f"Fewer than {LEAST_SEEDS} seeds of {recipe} are recorded{where}.")
     return values
 
 

@@ -229,8 +229,8 @@ def rates_figure(rates: dict[str, Rate], *, title: str = "") -> Picture:
 
 
 @styled
-def residual_figure(trace: pd.DataFrame, *, alpha: float, title: str = "How large the correction is") -> Picture:
-    """Mean size per action dimension of the base action and of alpha times the residual over one episode.
+def residual_figure(trace: pd.DataFrame, *, bound: float, title: str = "How large the correction is") -> Picture:
+    """Mean size per action dimension of the base action and of alpha times the residual over one episode, and their bound.
 
     `trace` has one row a step: step, base, residual (already times alpha), success; `video.trace` makes it.
     """
@@ -240,14 +240,14 @@ def residual_figure(trace: pd.DataFrame, *, alpha: float, title: str = "How larg
     ax.plot(trace.step, trace.base, color=COLORS["base"], label="base action, mean |a|")
     ax.fill_between(trace.step, trace.residual, color=COLORS["decorated"], alpha=0.35, lw=0)
     ax.plot(trace.step, trace.residual, color=COLORS["decorated"], label="correction, mean |alpha x residual|")
-    ax.axhline(alpha, color=COLORS["decorated"], ls=":", lw=1.2, label=f"its bound, alpha = {alpha:g}")
+    ax.axhline(bound, color=COLORS["decorated"], ls=":", lw=1.2, label=f"its bound, {bound:g} on average")
     solved = trace.step[trace.success.astype(bool)]
     if len(solved):
         ax.axvline(solved.iloc[0], color=COLORS["gained"], lw=1.6)
         ax.annotate(f"solved at step {solved.iloc[0]}", (solved.iloc[0], 1), (5, -4), textcoords="offset points",
                     xycoords=("data", "axes fraction"), va="top", color=COLORS["gained"], weight="bold")
     ax.set(xlabel="step of the episode", ylabel="size per dimension", xlim=(0, trace.step.max()),
-           ylim=(0, 1.2 * max(alpha, trace.base.max(), trace.residual.max())))
+           ylim=(0, 1.2 * max(bound, trace.base.max(), trace.residual.max())))
     ax.set_title(title)
     figure.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=8.5)
     return figure

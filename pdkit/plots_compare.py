@@ -93,7 +93,7 @@ def curves_figure(curves: pd.DataFrame, *, column: str = "success_once", labels:
     thousands(ax)
     _values(ax, "y", column, ylabel, log)
     ax.set_title(title)
-    figure.legend(loc="outside right upper", fontsize=8.5, title="recipe (seeds)", title_fontsize=8.5)
+    figure.legend(loc="outside right upper", fontsize=8.5, title="recipe (seeds)\nband: least to largest seed", title_fontsize=8.5)
     return figure
 
 
@@ -188,7 +188,7 @@ def panels_figure(curves: pd.DataFrame, panels: Mapping[str, Sequence[str]], *, 
     for ax in axes[:, 1:].flat:
         ax.set_ylabel("")
     axes[0, 0].set_xlim(0, None)
-    figure.supxlabel("environment steps", fontsize=10)
+    figure.supxlabel("environment steps; band: 95 % bootstrap interval over seeds", fontsize=10)
     figure.suptitle(title, x=0.01, ha="left", weight="bold", fontsize=12)
     return figure
 

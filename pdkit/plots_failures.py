@@ -57,7 +57,7 @@ def drift_figure(drifts: pd.DataFrame, *, bound: float, distance: float) -> Pict
     for name, rows in drifts.groupby("arm", sort=False):
         ax.plot(rows["update"], rows.drift, "-o", ms=3.5, color=ARMS.get(name, OTHERS[0]), label=name)
     right = drifts["update"].max()
-    ax.annotate(f"bound alpha = {bound:g}", (right, bound), (-2, 3), textcoords="offset points", ha="right", color=COLORS["decorated"],
+    ax.annotate(f"bound {bound:g}", (right, bound), (-2, 3), textcoords="offset points", ha="right", color=COLORS["decorated"],
                 fontsize=8.5)
     ax.annotate("distance to the better policy", (right, distance), (-2, -12), textcoords="offset points", ha="right", color="#888888",
                 fontsize=8.5)

@@ -3,7 +3,7 @@
 data/results/claims.csv has a row a claim:
 
     claim     a sentence                         seeds     of the training, such as "0 1 2 3 4"
-    section   where the paper makes it           measured  what was found
+    section   where the paper makes it           measured  what was found; of an untested one, why nothing was
     tasks     where it was tested; of an         interval  its interval, with the method
               untested one, the paper's tasks    verdict   reproduced, partly, not or untested
                                                  command   that makes the numbers again
@@ -65,7 +65,7 @@ def claim_problems(claims: pd.DataFrame) -> list[str]:
             found.append(f"{where} has the verdict {row.verdict!r}; known are {', '.join(VERDICTS)}.")
             continue
         if row.verdict == "untested":
-            given = [name for name in NEEDED if name != "tasks" and getattr(row, name)]
+            given = [name for name in NEEDED if name not in ("tasks", "measured") and getattr(row, name)]
             found += [f"{where} is untested but has {', '.join(given)}; give it a verdict."] if given else []
             continue
         missing = [name for name in NEEDED if not getattr(row, name)]
@@ -116,9 +116,9 @@ def lines(claims: pd.DataFrame) -> list[str]:
     told = []
     for row in claims.itertuples():
         told += textwrap.wrap(f"{row.verdict:11} {row.section:17} {row.claim}", 118, subsequent_indent=" " * 30)
-        if row.verdict != "untested":
-            for text in (f"{row.measured}; {row.interval}", f"{row.tasks}, seeds {row.seeds}", row.command):
-                told += textwrap.wrap(text, 118, initial_indent=" " * 30, subsequent_indent=" " * 32, break_on_hyphens=False)
+        found = (f"{row.measured}; {row.interval}", f"{row.tasks}, seeds {row.seeds}", row.command)
+        for text in (row.measured,) if row.verdict == "untested" else found:
+            told += textwrap.wrap(text, 118, initial_indent=" " * 30, subsequent_indent=" " * 32, break_on_hyphens=False)
     return told
 
 
@@ -130,7 +130,8 @@ def sections(claims: pd.DataFrame, tables: dict[str, pd.DataFrame], folder: Path
         parts.append(page.Section("All tasks", [page.figure(_range(tables), "base and decorated policies of the main job")]))
     parts.append(page.Section("Tested", [page.table(tested.to_dict("records")) if len(tested) else "Nothing yet."]))
     if len(rest):
-        parts.append(page.Section("Untested", [page.table(rest[["claim", "section", "tasks"]].to_dict("records"))]))
+        why = rest[["claim", "section", "tasks", "measured"]].rename(columns={"measured": "why"})
+        parts.append(page.Section("Untested", [page.table(why.to_dict("records"))]))
     for name, table in tables.items():
         again = sorted(set(table["sweep"].dropna() if "sweep" in table else table.command))
         rows = table.drop(columns=["command", "sweep"], errors="ignore").to_dict("records")

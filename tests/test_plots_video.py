@@ -118,7 +118,7 @@ def test_paired_figure_counts_cells():
 def test_other_figures_draw_and_refuse_nonsense():
     rng = np.random.default_rng(0)
     trace = pd.DataFrame({"step": [1, 2, 3], "base": 0.3, "residual": 0.05, "success": [False, True, True]})
-    figure = plots.residual_figure(trace, alpha=0.1)
+    figure = plots.residual_figure(trace, bound=0.1)
     assert [t.get_text() for t in figure.axes[0].texts] == ["solved at step 2"]
     centres = np.array([[-1.0, 0, 0], [1.0, 0, 0]])
     actions = np.concatenate([rng.normal(c, 0.05, (k, 3)) for c, k in zip(centres, (30, 10), strict=True)])

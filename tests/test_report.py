@@ -9,7 +9,8 @@ from pdkit.stats import wilson
 
 TESTED = {"claim": "It works.", "section": "D.1", "tasks": "Door", "seeds": "0 1", "measured": "97 %", "interval": "95 to 99 % (Wilson)",
           "verdict": "reproduced", "command": "pdkit train decorated Door"}
-UNTESTED = dict.fromkeys(report.COLUMNS, "") | {"claim": "It <b>might</b>, too.", "section": "F.3", "verdict": "untested"}
+UNTESTED = dict.fromkeys(report.COLUMNS, "") | {"claim": "It <b>might</b>, too.", "section": "F.3", "verdict": "untested",
+                                                   "measured": "Nothing was run."}
 ROW = {"task": "Door", "recipe": "lesson", "seed": 0, "base_success": 0.5, "decorated_success": 0.9,
        "command": "pdkit train decorated Door"}
 
@@ -35,14 +36,16 @@ def test_the_report_prints_the_claims_and_writes_a_page(results, capsys):
     code, out, err = call(results, capsys)
     assert (code, err) == (0, "")
     assert "reproduced  D.1               It works." in out and "97 %; 95 to 99 % (Wilson)" in out and "Door, seeds 0 1" in out
+    assert "Nothing was run." in out and ";" not in out[out.index("Nothing was run."):].splitlines()[0]
     assert "1 reproduced, 0 partly, 0 not, 1 untested; 1 rows in 1 recorded tables" in out
     html = (results / "page.html").read_text()
-    assert "It works." in html and "It &lt;b&gt;might&lt;/b&gt;, too." in html and "Recorded: main" in html and "nan" not in html
+    assert "It works." in html and "It &lt;b&gt;might&lt;/b&gt;, too." in html
+    assert "Nothing was run." in html and "Recorded: main" in html and "nan" not in html
 
 
 @pytest.mark.parametrize("changes, said", [
     ({"verdict": "maybe"}, "has the verdict 'maybe'; known are reproduced, partly, not, untested."),
-    ({"verdict": "untested"}, "is untested but has seeds, measured, interval, command"),
+    ({"verdict": "untested"}, "is untested but has seeds, interval, command"),
     ({"measured": ""}, "is 'reproduced' but lacks measured."),
     ({"interval": " ", "seeds": "", "verdict": "not"}, "is 'not' but lacks seeds, interval."),
     ({"command": "", "verdict": "partly"}, "is 'partly' but lacks command."),

@@ -142,7 +142,7 @@ def test_without_results_nothing_is_judged(results):
     by_hand = ~CLAIMS.claim.map(lambda claim: any(claim.startswith(start) for start in verdicts.MEASURES))
     now = verdicts.updated(CLAIMS)
     assert now[by_hand].equals(CLAIMS[by_hand]) and set(now.verdict[~by_hand]) == {"untested"}
-    assert (now[~by_hand][["tasks", "seeds", "measured", "interval", "command"]] == "").all(axis=None)
+    assert (now[~by_hand][["tasks", "seeds", "interval", "command"]] == "").all(axis=None) and (now.measured != "").all()
 
 
 @pytest.mark.parametrize("ends, verdict", [([0.9, 0.8, 0.85], "reproduced"), ([0.25, 0.15, 0.28], "not"), ([0.5, 0.2, 0.45], "partly")])
@@ -671,6 +671,17 @@ def test_what_cal_ql_saves_and_what_its_actor_is(results):
 def test_what_a_lesson_cannot_reach_stays_untested():
     for claim in starting("Cal-QL in its original setting", "Cal-QL is unstable when run longer"):
         assert verdicts.find(claim) is None and CLAIMS.verdict[CLAIMS.claim == claim].item() == "untested"
+
+
+def test_an_untested_claim_says_why():
+    untested = CLAIMS[CLAIMS.verdict == "untested"]
+    assert len(untested) and (untested.measured != "").all()
+
+
+def test_two_sides_near_0_are_told_as_the_reason(results):
+    calql_results(results, {"calql": 0.03, "sac_finetune": 0.02, "calql_b": 0.2}, {"calql_b": (0.1, 0.2)})
+    [row] = verdicts.updated(CLAIMS[CLAIMS.claim.str.startswith("A critic pre-trained by Cal-QL")]).itertuples()
+    assert row.verdict == "untested" and row.measured == "All sides end near 0: this budget does not tell them apart."
 
 
 def test_the_shipped_claims_are_what_the_recorded_results_say():

@@ -56,7 +56,9 @@ _CALQL_ORIGINAL = _CALQL_PAPER | dict(utd=1.0, batch=256, gamma=0.99, actor_lr=1
                                       init_temperature=0.1)  # there 1, with rewards that are ten times as large
 
 METHODS: dict[str, Method] = {
-    "policy_decorator": Method("Policy Decorator", "facts.md 1"),
+    "policy_decorator": Method(
+        "Policy Decorator", "the paper; facts.md 1: a residual over the frozen base policy, bounded by alpha, switched on over H steps",
+    ),
     "residual_rl": Method(
         "Residual RL", "Johannink et al. 2019; appendix B.5, G.1; facts.md 3.5: the decorator without bound and schedule",
         changes=dict(alpha=1.0, alpha_scale=(), H=0, warmup="uniform", residual_penalty=0.0)),

@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import pandas as pd
 
@@ -26,18 +27,24 @@ def _rule(claim: str) -> Measure | None:
     return next((measure for start, measure in MEASURES.items() if claim.startswith(start)), None)
 
 
-def find(claim: str) -> Finding | None:
-    """What is recorded of a claim (its whole sentence), or None where nothing, or too little, is."""
+def _judged(claim: str) -> Finding | None:
+    """What a claim's rule finds, or why it finds nothing (`measured` of an untested one); None where there is no rule."""
     try:
         return measure() if (measure := _rule(claim)) else None
-    except TooLittle:
-        return None
+    except TooLittle as why:
+        return replace(UNTESTED, measured=str(why))
+
+
+def find(claim: str) -> Finding | None:
+    """What is recorded of a claim (its whole sentence), or None where nothing, or too little, is."""
+    found = _judged(claim)
+    return None if found is None or found.verdict == UNTESTED.verdict else found
 
 
 def updated(claims: pd.DataFrame) -> pd.DataFrame:
-    """The table of claims with the verdict of every rule, "untested" where too little is recorded for it (now); rows without a rule as
-    they are."""
-    rows = [row | (vars(find(row["claim"]) or UNTESTED) if _rule(row["claim"]) else {}) for row in claims.to_dict("records")]
+    """The table of claims with the verdict of every rule, "untested" and the reason where too little is recorded for it (now); rows without
+    a rule as they are."""
+    rows = [row | (vars(found) if (found := _judged(row["claim"])) else {}) for row in claims.to_dict("records")]
     return pd.DataFrame(rows, columns=claims.columns)
 
 
