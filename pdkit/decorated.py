@@ -73,7 +73,7 @@ def load_decorated(folder: str | Path) -> Decorated:
     weights = folder / "actor.safetensors"
     if not isinstance(card, dict) or card.get("format") != FORMAT:
         raise PdkitError(f"{folder}/decorated.json is not a {FORMAT} file.")
-    if not weights.exists() or sha256(weights) != card["actor_sha256"]:
+    if not weights.exists() or sha256(weights) != card.get("actor_sha256"):
         raise PdkitError(f"{weights} is missing, truncated or altered; restore it or train it again with `pdkit run`.")
     try:
         actor = Actor(**card["actor"])

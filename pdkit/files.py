@@ -51,8 +51,13 @@ def atomic_file(path: str | Path) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def atomic_folder(path: str | Path) -> Iterator[Path]:
-    """The same for a folder: a reader sees the old one or the new one, never a mixture."""
-    path = Path(path)
+    """The same for a folder: a reader sees the old one, the new one or, for a moment, none (see `recover`), never a mixture.
+
+    Raises PdkitError, too, when something else stands there: a folder that is not empty and has none of the new one's files.
+    """
+    path = Path(os.path.abspath(path))
+    if path == path.parent:
+        raise PdkitError(f"{path} cannot be replaced; name a folder below it.")
     temporary = path.with_name(f"{path.name}.tmp-{os.getpid()}")
     old = path.with_name(f"{path.name}.tmp-old-{os.getpid()}")
     try:
@@ -60,6 +65,7 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
         shutil.rmtree(temporary, ignore_errors=True)
         temporary.mkdir()
         yield temporary
+        check_replaceable(path, *(part.name for part in temporary.iterdir()))
         if path.exists():
             os.replace(path, old)
         os.replace(temporary, path)
@@ -70,6 +76,36 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
             os.replace(old, path)
         shutil.rmtree(temporary, ignore_errors=True)
         shutil.rmtree(old, ignore_errors=True)
+
+
+def check_replaceable(path: str | Path, *names: str) -> None:
+    """Raises PdkitError for a folder that holds something, but none of the files `names`, by which it would be known as one of ours."""
+    path = Path(os.path.abspath(path))
+    if path.exists() and not path.is_dir():
+        raise PdkitError(f"{path} is a file; name another folder.")
+    if path.exists() and any(path.iterdir()) and not any((path / name).exists() for name in names):
+        raise PdkitError(f"{path} holds something else (no {' or '.join(sorted(names))}); name another folder, or an empty one.")
+
+
+def recover(path: str | Path) -> None:
+    """Put back the folder at `path` that a killed process had moved away for a new one, and remove what such processes left beside it."""
+    path = Path(os.path.abspath(path))
+    left = [part for part in path.parent.glob(f"{path.name}.tmp-*") if part.is_dir() and not _alive(part.name.rpartition("-")[2])]
+    old = [part for part in left if part.name.startswith(f"{path.name}.tmp-old-")]
+    if old and not path.exists():
+        os.replace(max(old, key=lambda part: part.stat().st_mtime), path)
+    for part in left:
+        shutil.rmtree(part, ignore_errors=True)
+
+
+def _alive(pid: str) -> bool:
+    try:
+        os.kill(int(pid), 0)
+    except (ProcessLookupError, ValueError):
+        return False
+    except PermissionError:
+        return True
+    return True
 
 
 def write_json(path: str | Path, value: Any) -> None:

@@ -64,6 +64,9 @@ class OnlineConfig:
             raise PdkitError("The loop needs demo_fraction in [0, 1), gamma in (0, 1], n_step >= 1, utd >= 0 and batch >= 2.")
         if not 0 <= self.start_fraction < 1:
             raise PdkitError(f"start_fraction must be at least 0 and below 1, not {self.start_fraction}.")
+        if min(self.train_limit, self.success_tail, self.warmup_steps, self.eval_every, self.eval_episodes) < 0 or self.num_envs < 1:
+            raise PdkitError("The loop needs train_limit, success_tail, warmup_steps, eval_every and eval_episodes of 0 or more, and "
+                             "num_envs of 1 or more.")
         if self.seed < 0:
             raise PdkitError(f"The seed must be 0 or more, not {self.seed}.")
         if self.demo_fraction and 0 in self.decorator.alpha_scale:

@@ -3,7 +3,7 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
-import tempfile
+import os
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,11 +18,20 @@ from .files import DATA, atomic_file, read_json, write_json
 from .plots import save_small
 from .runs import describe_machine
 from .stats import wilson
+from .sweep_spec import NAME
 from .tasks import TASKS
 from .tasks.partnet import object_set
 
 KEYS = ["task", "recipe", "seed"]  # a row with the same ones is replaced
 OWN = ",partnet"  # behind the recipe of a row on the user's own objects
+
+
+def check_names(record_as: str | None, recipe: str | None = None) -> None:
+    """Raises PdkitError for a record's name that is no word, or a recipe that would leave its folder: before the work, not after."""
+    if record_as is not None and not NAME.fullmatch(record_as):
+        raise PdkitError(f"--record takes a word of letters, digits, dots and dashes, not {record_as!r}.")
+    if recipe is not None and ("/" in recipe or recipe.startswith(".") or not recipe):
+        raise PdkitError(f"--recipe becomes part of a folder's name; {recipe!r} cannot.")
 
 
 def record(name: str, rows: pd.DataFrame, curves: pd.DataFrame) -> None:
@@ -35,13 +44,13 @@ def record(name: str, rows: pd.DataFrame, curves: pd.DataFrame) -> None:
     folder, tables = DATA / "results", []
     rows, curves = (table.assign(recipe=table.recipe.where(~_on_own_objects(table), table.recipe + OWN)) if len(table) else table
                     for table in (rows, curves))
-    with _alone(name):
+    with _alone():
         for path, new in ((folder / f"{name}.csv", rows), (folder / f"{name}_curves.csv", curves)):
             if new.empty:
                 continue
             tables.append(_merged(path, new))
             with atomic_file(path) as temporary:
-                tables[-1].to_csv(temporary, index=False, float_format="%.6g")
+                _whole(tables[-1]).to_csv(temporary, index=False, float_format="%.6g")
         again = tables[0]["sweep"].fillna(tables[0].command) if "sweep" in tables[0] else tables[0].command
         path = folder / f"{name}_manifest.json"
         write_json(path, {"written": time.strftime("%Y-%m-%d"), "machines": _machines(path), "again": sorted(set(again))})
@@ -128,11 +137,26 @@ def _machines(path: Path) -> list[dict[str, Any]]:
 
 
 @contextlib.contextmanager
-def _alone(name: str) -> Iterator[None]:
+def _alone() -> Iterator[None]:
     """Wait until no other process records: two trainings that end together must not lose each other's rows."""
-    with open(Path(tempfile.gettempdir()) / f"pdkit-record-{name}.lock", "w") as handle:
+    folder = DATA / "results"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        handle = os.open(folder, os.O_RDONLY)
+    except OSError as error:
+        raise PdkitError(f"Cannot record in {folder}: {error.strerror}.") from None
+    try:
         fcntl.flock(handle, fcntl.LOCK_EX)
         yield
+    finally:
+        os.close(handle)
+
+
+def _whole(table: pd.DataFrame) -> pd.DataFrame:
+    """The table with its counts as whole numbers: a count that some rows lack is a float to pandas, and would be rounded to six digits."""
+    floats = table.select_dtypes("float")
+    counts = [name for name in floats if (floats[name].dropna() % 1 == 0).all()]
+    return table.astype(dict.fromkeys(counts, "Int64"))
 
 
 def _merged(path: Path, new: pd.DataFrame) -> pd.DataFrame:
@@ -170,34 +194,34 @@ def figure(table: pd.DataFrame, curves: pd.DataFrame, task: str = "Door") -> Fig
     bases = {f"base ({kind})" if len(kinds) > 1 else "base": starts.iloc[0] for kind, starts in kinds if starts.nunique() == 1}
     scattered = {kind for kind, starts in kinds if starts.nunique() > 1}
     ticks = {name: rows.base_success.mean() for name, _, rows in groups if rows[kind_of].iloc[0] in scattered}
-    bars = [(name, [value], "0.65") for name, value in bases.items()]
+    bars = [(name, [value], "0.65", table.episodes.iloc[0]) for name, value in bases.items()]
     for i, (name, recipe, rows) in enumerate(groups):
         color = colors(i % colors.N)
-        curve = curves[(curves.recipe == recipe) & curves.seed.isin(rows.seed)].dropna(subset=["success_once"])
+        curve = curves[(curves.recipe == recipe) & curves.seed.isin(rows.seed)].reindex(columns=["seed", "step", "success_once"]).dropna()
         # Seeds are logged a few steps apart: the n-th evaluations belong together.
         curve = curve.assign(number=curve.groupby("seed").cumcount()).groupby("number")[["step", "success_once"]].mean()
         left.plot(curve.step / 1000, 100 * curve.success_once, "-o", ms=3, lw=1.2, color=color, label=name)
-        bars.append((name, list(rows.decorated_success), color if several else "#2c9f6b"))
+        bars.append((name, list(rows.decorated_success), color if several else "#2c9f6b", rows.episodes.iloc[0]))
     for value in bases.values():
         left.axhline(100 * value, color="0.4", ls="--", lw=1, label="base policy")
     left.set(xlabel="environment steps (thousands)", ylabel="success within the episode (%)", ylim=(0, 102),
              title=f"{task}: evaluations during training")
     if not several:
         left.legend(fontsize=8, loc="lower right")
-    count = int(table.episodes.iloc[0])
-    for y, (name, values, color) in enumerate(reversed(bars)):
+    for y, (name, values, color, count) in enumerate(reversed(bars)):
         value = sum(values) / len(values)
         right.barh(y, 100 * value, color=color)
         if means and name not in bases:
             right.plot([100 * v for v in values], [y] * len(values), "k.", ms=4)
         else:
-            rate = wilson(round(value * count), count)
+            rate = wilson(round(value * count), int(count))
             right.errorbar(100 * value, y, xerr=[[100 * (value - rate.low)], [100 * (rate.high - value)]], color="k", capsize=3, lw=1)
         if name in ticks:
             right.plot([100 * ticks[name]] * 2, [y - 0.4, y + 0.4], color="0.4", lw=2)
         right.text(3, y, f"{100 * value:.0f}", va="center", color="white", weight="bold", fontsize=8)
-    right.set_yticks(range(len(bars)), [name for name, _, _ in reversed(bars)], fontsize=8)
-    shown = f"{count} test episodes, {'mean and seeds' if means else '95 % intervals'}"
+    right.set_yticks(range(len(bars)), [name for name, *_ in reversed(bars)], fontsize=8)
+    least, most = int(table.episodes.min()), int(table.episodes.max())
+    shown = f"{least if least == most else f'{least} to {most}'} test episodes, {'mean and seeds' if means else '95 % intervals'}"
     right.set(xlabel="success within the episode (%)", xlim=(0, 102), title=f"{shown}\n(grey: its start)" if ticks else shown)
     for ax in (left, right):
         ax.spines[["top", "right"]].set_visible(False)

@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 
 from .errors import PdkitError
-from .files import ROOT, atomic_file, atomic_folder, read_json, sha256, write_json
+from .files import ROOT, atomic_file, atomic_folder, read_json, recover, sha256, write_json
 from .machine import cores
 
 PACKAGES = ("torch", "numpy", "gymnasium", "gymnasium-robotics", "mujoco", "mani-skill", "sapien")
@@ -60,6 +60,7 @@ class Run:
     def __init__(self, folder: str | Path, kind: str, parameters: dict[str, Any]):
         self.folder = Path(folder)
         self.manifest_path = self.folder / "manifest.json"
+        recover(self.folder / "checkpoint")
         if self.manifest_path.exists():
             self.manifest = read_json(self.manifest_path)
             self._must_match(kind, parameters)
@@ -99,11 +100,11 @@ class Run:
         return (self.folder / "checkpoint" / "state.json").exists()
 
     def save_checkpoint(self, arrays: dict[str, np.ndarray], values: dict[str, Any]) -> None:
-        """Replace the checkpoint by named arrays and JSON values; a crash leaves the old one."""
+        """Replace the checkpoint by named arrays and JSON values; after a crash there is the old one (`recover` puts it back)."""
         from safetensors.numpy import save_file
 
         with atomic_folder(self.folder / "checkpoint") as temporary:
-            save_file({k: np.array(v, order="C") for k, v in arrays.items()}, temporary / "arrays.safetensors")
+            save_file({k: np.asarray(v, order="C") for k, v in arrays.items()}, temporary / "arrays.safetensors")
             write_json(temporary / "state.json", values | {"sha256": sha256(temporary / "arrays.safetensors"), "time": time.time()})
 
     def load_checkpoint(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:

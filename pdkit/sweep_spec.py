@@ -39,8 +39,8 @@ from typing import Any
 from .errors import PdkitError, unknown
 
 KINDS = ("train", "base", "notebook")
-NAME = re.compile(r"[\w.-]+")
 SHA256 = re.compile(r"[0-9a-f]{64}")
+NAME = re.compile(r"\w[\w.-]*")  # of a sweep, and of what it records
 OWN_BASE = re.compile(r"runs(/(?!\.)[\w.+-]+)+")
 KEYS = ("name", "kind", "seeds", "record", "minutes", "fixed", "grid", "cells", "bases")
 

@@ -6,6 +6,7 @@ import hashlib
 import json
 import math
 import os
+import shlex
 import sys
 from dataclasses import asdict
 from pathlib import Path
@@ -19,7 +20,7 @@ from .demos import Demos, sources
 from .demos.cli import Progress
 from .errors import PdkitError
 from .evaluate import evaluate
-from .files import DATA, atomic_file, runs_root, write_json
+from .files import DATA, atomic_file, check_replaceable, runs_root, write_json
 from .imitate import configured, imitate
 from .methods import METHODS
 from .methods.registry import base_folder as shipped_base
@@ -34,7 +35,7 @@ from .pixels.task import ENCODER, encoder_of, pixel_spec, save_visual
 from .policies import POLICIES, Policy, load_policy, save_policy
 from .policies.base import read_card
 from .profiles import PROFILES, differences, flat
-from .recorded import record
+from .recorded import check_names, record
 from .runs import Run, describe_machine, origin
 from .seeds import reported_seeds
 from .tasks import get_task
@@ -111,6 +112,7 @@ def _base(args) -> int:
     config, architecture = configured(args.policy, settings)
     device = pick_device(args.device) if POLICIES[args.policy].learns else "cpu"
     out = Path(args.out) if args.out else runs_root() / "base" / f"{args.task}-{args.policy}{'-pixels' if args.pixels else ''}"
+    check_replaceable(out, "policy.json")  # before the work, not after
     print(f"{args.policy} on {demos.num} demonstrations of {args.task} ({demos.label}), on {device}: {config}", flush=True)
 
     def show(row: dict[str, float]) -> None:
@@ -131,7 +133,7 @@ def _base(args) -> int:
         policy, history = imitate(args.policy, demos, config, architecture, device=device, progress=show)
     best = max(history, key=lambda row: row.get("success_once", row["iteration"]))
     info = {"task": args.task, "demos": demos.num, "demos_checksum": demos.checksum, "label": demos.label, "imitate": asdict(config),
-            "selected": best, "seconds": history[-1]["seconds"], "command": "pdkit train " + " ".join(sys.argv[2:]), "device": device,
+            "selected": best, "seconds": history[-1]["seconds"], "command": shlex.join(["pdkit", "train", *sys.argv[2:]]), "device": device,
             "machine": describe_machine()}
     if args.pixels:
         save_visual(policy, encoder, out, info)
@@ -160,6 +162,7 @@ def _decorated(args) -> int:
     args.recipe = args.recipe or ("lesson" if args.method == "policy_decorator" else args.method)
     if args.episodes < 1 or min(args.seeds) < 0:
         raise PdkitError("--episodes must be at least 1 and every seed 0 or more.")
+    check_names(args.record, args.recipe)
     for seed in args.seeds:
         base = load_policy(base_folder)
         config = method_config(args.method, args.task, args.profile, seed, policy=base, **settings)
@@ -186,15 +189,15 @@ def _demos_of(folder: Path) -> int | None:
 
 def command_of(args, seed: int) -> str:
     """The command that makes one row again."""
-    method = [f"--method {args.method}"] if args.method != "policy_decorator" else []
-    parts = ["pdkit train decorated", args.task, *method, f"--profile {args.profile}", f"--seeds {seed}", f"--recipe {args.recipe}",
-             f"--episodes {args.episodes}", f"--threads {args.threads}"]
-    parts += [f"--base {args.base}"] if args.base else []
+    method = ["--method", args.method] if args.method != "policy_decorator" else []
+    parts = ["pdkit", "train", "decorated", args.task, *method, "--profile", args.profile, "--seeds", str(seed), "--recipe", args.recipe,
+             "--episodes", str(args.episodes), "--threads", str(args.threads)]
+    parts += ["--base", args.base] if args.base else []
     parts += ["--pixels"] if args.pixels else []
-    parts += [f"--demos {args.demos}"] if args.demos else []
-    parts += [f"--num-demos {args.num_demos}"] if args.num_demos else []
-    parts += ["--set " + " ".join(args.set)] if args.set else []
-    return " ".join(parts + ([f"--record {args.record}"] if args.record else []))
+    parts += ["--demos", args.demos] if args.demos else []
+    parts += ["--num-demos", str(args.num_demos)] if args.num_demos else []
+    parts += ["--set", *args.set] if args.set else []
+    return shlex.join(parts + (["--record", args.record] if args.record else []))
 
 
 def decorate(config, base: Policy, demos: Demos | None, out: Path, episodes: int, started_from: dict[str, Any],

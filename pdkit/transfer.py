@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import argparse
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -122,7 +123,8 @@ def corrected(kind: str, policy: Policy | Decorated, args: argparse.Namespace) -
         for row in rows.itertuples():
             print(f"{task}, corrected by at most {row.alpha:g}: {wilson(round(row.success * row.episodes), row.episodes)}")
         if args.record:
-            again = [f"pdkit evaluate {args.policy} --tasks {task} --episodes {args.episodes} --oracle {alpha:g} --record {args.record}"
+            own = shlex.quote(args.policy)
+            again = [f"pdkit evaluate {own} --tasks {task} --episodes {args.episodes} --oracle {alpha:g} --record {args.record}"
                      for alpha in rows.alpha]
             recorded.record(args.record, rows.assign(policy=policy.kind, recipe=named, seed=0, command=again), pd.DataFrame())
     return 0
@@ -148,6 +150,7 @@ def main(argv: list[str]) -> int:
         raise PdkitError("--oracle corrects a base policy as it was made; leave --sampling out.")
     if args.episodes < 1:
         raise PdkitError(f"--episodes must be at least 1, not {args.episodes}.")
+    recorded.check_names(args.record)
     set_threads(args.threads)
     kind, policy = load_any(args.policy)
     policy = sampled(policy, settings := parse_settings(args.sampling, "--sampling"))
@@ -165,7 +168,8 @@ def main(argv: list[str]) -> int:
     for row in rows.itertuples():
         print(f"{row.task}: {wilson(round(row.success * row.episodes), row.episodes)}; at the last step {row.success_at_end:.1%}")
     if args.record:
-        asked = f" --sampling {' '.join(args.sampling)}" if args.sampling else ""
-        command = f"pdkit evaluate {args.policy} --tasks {' '.join(args.tasks)} --episodes {args.episodes}{asked} --record {args.record}"
+        asked = ["--sampling", *args.sampling] if args.sampling else []
+        command = shlex.join(["pdkit", "evaluate", args.policy, "--tasks", *args.tasks, "--episodes", str(args.episodes), *asked,
+                              "--record", args.record])
         recorded.record(args.record, rows.assign(recipe=recipe, seed=0, command=command), pd.DataFrame())
     return 0

@@ -50,6 +50,10 @@ def test_data_are_compared_with_their_checksums(tmp_path, monkeypatch):
     (tmp_path / "checksums.json").write_text(json.dumps({**sums, "gone": "0"}))
     checks = doctor.check_data()
     assert [(c.status, c.text) for c in checks] == [("FAIL", "missing: gone"), ("FAIL", "altered: altered")]
+    (tmp_path / "results").mkdir()
+    (tmp_path / "results" / "x.csv").write_text("recorded since")
+    (tmp_path / "checksums.json").write_text(json.dumps({"good": sums["good"], "results/x.csv": "0"}))
+    assert [(c.status, c.text) for c in doctor.check_data()] == [("WARN", "other results than the shipped ones: results/x.csv")]
     (tmp_path / "checksums.json").write_text("{")
     assert statuses(doctor.check_data()) == ["FAIL"]
 

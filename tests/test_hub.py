@@ -150,6 +150,17 @@ def test_what_maniskill_s_motion_planner_does_is_solved_after_the_conversion(tmp
     assert_repeats(hub.from_hub(task, 1, tmp_path / "trajectory.h5"))
 
 
+def test_a_file_of_the_user_s_is_never_deleted(tmp_path, monkeypatch):
+    """Not even where it lies in the folder in which unpacked archives are kept."""
+    monkeypatch.setenv("PDKIT_RUNS", str(tmp_path))
+    mine = tmp_path / "hub" / "mine.h5"
+    mine.parent.mkdir()
+    mine.write_text("no trajectory")
+    with pytest.raises(PdkitError):
+        hub.from_hub("StackCube", 1, mine)
+    assert mine.read_text() == "no trajectory"
+
+
 def test_the_archive_is_fetched_once(copied, tmp_path, monkeypatch):
     answers = [io.BytesIO(zipped(copied).read_bytes())]
     monkeypatch.setattr(urllib.request, "urlopen", lambda url, timeout: answers.pop())

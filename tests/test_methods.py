@@ -89,6 +89,20 @@ def test_lora_starts_as_the_policy_and_trains_little(bet_sac, tmp_path):
     assert not torch.allclose(again.mean_action(stored), bet_sac.mean_action(stored), atol=1e-3)
 
 
+@pytest.mark.parametrize("rank", [0, 2, 4])
+def test_a_tuned_policy_is_tuned_on_from_where_it_is(bet_sac, tmp_path, rank):
+    tuned, stored = bet_sac.with_lora(2), torch.randn(5, 12)
+    with torch.no_grad():
+        next(p for n, p in tuned.named_parameters() if "regression.lora_B" in n).fill_(0.1)
+    further = tuned.with_lora(rank)
+    assert torch.allclose(further.mean_action(stored), tuned.mean_action(stored), atol=1e-5)
+    trained = [name for name, parameter in further.named_parameters() if parameter.requires_grad]
+    own = [name for name in trained if "lora_" in name or name.startswith("spread.")]
+    assert trained == own if rank else len(trained) == len(list(bet_sac.parameters()))
+    save_policy(further, tmp_path / "p")
+    assert torch.allclose(load_policy(tmp_path / "p").mean_action(stored), tuned.mean_action(stored), atol=1e-5)
+
+
 def test_scale_is_checked():
     with pytest.raises(PdkitError, match="factors in"):
         BeTForSAC({"obs_dim": 4, "act_dim": 2, **TINY, "scale": [0.5]})

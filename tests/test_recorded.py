@@ -1,4 +1,5 @@
 """Recorded results: what is read back from data/results."""
+import numpy as np
 import pandas as pd
 import pytest
 
@@ -102,3 +103,28 @@ def test_a_manifest_of_one_machine_is_taken_over(results, monkeypatch):
     monkeypatch.setattr(recorded, "describe_machine", lambda: {"cores": 2, "torch_threads": 1, "git": "new"})
     recorded.record("x", pd.DataFrame({"task": ["Door"], "recipe": ["a"], "seed": [0], "command": ["pdkit x"]}), pd.DataFrame())
     assert [machine["cores"] for machine in read_json(results / "x_manifest.json")["machines"]] == [4, 2]
+
+
+def test_counts_are_kept_to_the_last_digit_where_some_rows_lack_them(results):
+    row = {"task": "Door", "recipe": "x", "command": "pdkit"}
+    recorded.record("counts", pd.DataFrame([row | {"seed": 0, "steps": 1_234_567, "rate": 0.123456789}, row | {"seed": 1}]), pd.DataFrame())
+    written = (results / "counts.csv").read_text()
+    assert "1234567" in written and "0.123457" in written and "0.1234567" not in written
+
+
+def test_runs_without_evaluations_can_be_drawn():
+    table = pd.DataFrame([{"task": "Door", "recipe": "x", "seed": s, "base_success": 0.5, "decorated_success": 0.6, "episodes": n}
+                          for s, n in ((0, 1_000), (1, 20))])
+    left, right = recorded.figure(table, table[["task", "recipe", "seed"]].assign(step=10)).axes
+    assert "20 to 1000 test episodes" in right.get_title() and not any(len(line.get_xdata()) > 2 for line in left.lines)
+    widths = {round(float(np.ptp(segment[:, 0])), 1) for bars in right.collections for segment in bars.get_segments()}
+    assert {6.1, 39.5} <= widths  # Wilson's of 600 of 1,000 and of 12 of 20
+
+
+@pytest.mark.parametrize("name", ["mine/door", "..", "", ".x"])
+def test_a_record_s_name_is_a_word(name):
+    with pytest.raises(PdkitError, match="--record takes a word"):
+        recorded.check_names(name)
+    with pytest.raises(PdkitError, match="--recipe"):
+        recorded.check_names(None, name)
+    recorded.check_names("my-record.2", "fish,features=GPT")

@@ -1,11 +1,14 @@
 """SAC's targets and losses against numbers computed by hand: a wrong sign, a missing bootstrap or a detached term fails."""
+import copy
 import math
+import pickle
 
 import numpy as np
 import pytest
 import torch
 
 from pdkit.decorator import DecoratorConfig
+from pdkit.errors import PdkitError
 from pdkit.machine import cpu_has_bf16
 from pdkit.rl.networks import Actor, Critics
 from pdkit.rl.replay import NStep, Replay
@@ -292,3 +295,25 @@ def test_replay_overwrites_the_oldest_and_names_its_columns():
     assert replay.size == 3 and sorted(columns["reward"].tolist()) == [31, 32, 33]
     assert columns["residual"].shape == (3, 1) and columns["discount"].tolist() == [63, 61, 62]
     assert (columns["next_base"][:, 0] - columns["base"][:, 0]).tolist() == [30, 30, 30]
+
+
+def test_a_copy_of_a_compiled_actor_has_weights_of_its_own():
+    """What evaluation and the result of a run are made of, where nothing is averaged."""
+    agent, x = make(compile=True, average=0.0), torch.randn(4, 3)
+    other = copy.deepcopy(agent.actor)
+    with torch.no_grad():
+        other.head.bias.fill_(0.5)
+        other.net[0].weight.zero_()
+    with torch.compiler.set_stance("force_eager"):
+        plain = Actor(3, 2, 16, 2, False, (-5.0, 2.0))
+        plain.load_state_dict(other.state_dict())
+        assert torch.equal(other.mean_action(x), plain.mean_action(x))
+        assert not torch.allclose(agent.actor.mean_action(x), other.mean_action(x), atol=0.1)
+        assert torch.equal(pickle.loads(pickle.dumps(other)).mean_action(x), plain.mean_action(x))
+
+
+@pytest.mark.parametrize("changes", [{"init_temperature": 0.0}, {"actor_every": 0}, {"layers": 0}, {"hidden": 0}, {"grad_clip": -1.0},
+                                     {"log_std_range": (2.0, -5.0)}, {"residual_penalty": -1.0}])
+def test_settings_that_cannot_work_are_refused(changes):
+    with pytest.raises(PdkitError, match="SAC needs"):
+        SACConfig(**changes)

@@ -1,6 +1,8 @@
 """`pdkit train`, `pdkit demos` and the sources of demonstrations."""
+import shlex
 import sys
 from dataclasses import replace
+from types import SimpleNamespace
 
 import minari
 import numpy as np
@@ -57,7 +59,12 @@ def test_demonstrations_from_the_command_line(monkeypatch, tmp_path, capsys):
     ("train", "decorated", "Door", "--set", "log_std_range=(1.0,)"), ("train", "base", "Door", "--set", "eval_every=0"),
     ("train", "base", "Door", "--set", "lr=fast"), ("train", "decorated", "Door", "--set", "batch=100000"),
     ("train", "decorated", "Door", "--base", "nowhere"), ("train", "base", "Door", "--device", "gpu"),
-    ("train", "base", "Door", "--episodes", "-1"),
+    ("train", "base", "Door", "--episodes", "-1"), ("train", "base", "Door", "--out", str(DATA)), ("train", "base", "Door", "--out", "/"),
+    ("train", "decorated", "Door", "--record", "a/b"), ("train", "decorated", "Door", "--recipe", "../x"),
+    ("train", "decorated", "Door", "--set", "init_temperature=0.0"), ("train", "decorated", "Door", "--set", "actor_every=0"),
+    ("train", "decorated", "Door", "--set", "layers=0"), ("train", "decorated", "Door", "--set", "train_limit=-1"),
+    ("train", "decorated", "Door", "--set", "log_std_range=(2.0,-5.0)"),
+    ("evaluate", str(DATA / "checkpoints" / "Door" / "base"), "--tasks", "Door", "--record", ".."),
 ])
 def test_bad_input_is_one_sentence_and_exit_code_2(monkeypatch, capsys, words):
     assert call(monkeypatch, *words) == 2
@@ -162,6 +169,14 @@ def test_training_from_the_command_line_records_a_row_a_seed(monkeypatch, tmp_pa
     assert policy.base.state_dict().keys() == base.state_dict().keys()
     with pytest.raises(PdkitError, match="differing: demos, num_demos"):  # the same folder with other demonstrations is another run
         train.main([*words[1:], "--num-demos", "2"])
+
+
+def test_the_command_of_a_row_can_be_pasted_into_a_shell():
+    args = SimpleNamespace(task="Door", method="policy_decorator", profile="lesson", recipe="wide", episodes=60, threads=1, base="my base",
+                           pixels=False, demos=None, num_demos=None, set=["alpha_scale=(1.0, 1.0)"], record="x")
+    words = shlex.split(train.command_of(args, 3))
+    assert words[:3] == ["pdkit", "train", "decorated"] and words[words.index("--base") + 1] == "my base"
+    assert words[words.index("--set") + 1] == "alpha_scale=(1.0, 1.0)" and words[words.index("--seeds") + 1] == "3"
 
 
 def test_a_record_of_another_task_alone_can_be_drawn(monkeypatch, tmp_path):

@@ -142,7 +142,8 @@ def load_demos(path: str | Path) -> Demos:
     except (SafetensorError, OSError, json.JSONDecodeError, UnicodeDecodeError) as error:
         raise PdkitError(f"{path} is not a readable demonstration file (truncated or another format); restore it or make it again "
                          "with `pdkit demos`.") from error
-    if not isinstance(card, dict) or card.get("format") != FORMAT or set(arrays) != set(_DTYPES):
+    known = isinstance(card, dict) and card.get("format") == FORMAT and {"task", "label", "how", "command", "checksum"} <= set(card)
+    if not known or set(arrays) != set(_DTYPES):
         raise PdkitError(f"{path} is not a {FORMAT} file; it was written by something else.")
     for name, dtype in _DTYPES.items():
         if arrays[name].dtype != dtype:

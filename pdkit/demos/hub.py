@@ -64,7 +64,7 @@ def from_hub(task: str, num: int, file: str | Path | None = None, progress: Call
     try:
         maker, episodes = read_trajectories(path, spec.make.env_id)
     except PdkitError:
-        if path.is_relative_to(runs_root() / "hub"):
+        if path != Path(file or ""):  # what was unpacked here, never a user's own file
             shutil.rmtree(path.parent)  # so that the next call unpacks, or fetches, it anew
         raise
     kept, elsewhere, tried = [], 0, 0

@@ -167,7 +167,7 @@ def load_jump_start(folder: str | Path) -> JumpStart:
     """The policy saved in `folder`. Raises PdkitError when a part is missing, altered or does not fit."""
     folder = Path(folder)
     card = read_json(folder / "jump_start.json")
-    if not isinstance(card, dict) or card.get("format") != FORMAT:
+    if not isinstance(card, dict) or card.get("format") != FORMAT or "guide_steps" not in card:
         raise PdkitError(f"{folder}/jump_start.json is not a {FORMAT} file.")
     learner = load_decorated(folder / "learner")
     learner.actor.register_buffer("guide_steps", torch.tensor(int(card["guide_steps"])))

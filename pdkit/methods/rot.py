@@ -54,7 +54,7 @@ class ROT(OTRewarded, FineTune):
         critics = TrunkCritics(dim, self.spec.act_dim, m.ot_trunk, c.sac.hidden, c.sac.layers, c.sac.num_critics, c.sac.critic_layer_norm)
         agent = ROTAgent(dim, self.spec.act_dim, c.sac, c.decorator, device=c.device, actor=self._start_policy.with_lora(m.lora),
                          critics=critics, critic_view=self._last_observation)
-        agent.start, agent.bc_weight, agent.expert_batch = self._start_policy, m.bc_weight, c.batch // 2
+        agent.start, agent.bc_weight, agent.expert_batch = self._start_policy.to(c.device), m.bc_weight, c.batch // 2
         agent.windows = Windows(self._expert, self._start_policy.window, pad_start=True)
         self._phi = copy.deepcopy(critics.trunk).requires_grad_(False)
         return agent

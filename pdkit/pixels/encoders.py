@@ -123,7 +123,7 @@ def load_encoder(folder: str | Path) -> Encoder:
     card, weights = read_json(folder / "encoder.json"), folder / "weights.safetensors"
     if not isinstance(card, dict) or card.get("format") != FORMAT:
         raise PdkitError(f"{folder}/encoder.json is not a {FORMAT} file; it was written by something else or another version.")
-    if not weights.exists() or sha256(weights) != card["weights_sha256"]:
+    if not weights.exists() or sha256(weights) != card.get("weights_sha256"):
         raise PdkitError(f"{weights} is missing, truncated or altered; restore it or train it again with `pdkit train base --pixels`.")
     try:
         values = card["view"]

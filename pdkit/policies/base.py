@@ -157,12 +157,12 @@ def load_policy(folder: str | Path, device: str | torch.device = "cpu") -> Polic
 
     folder = Path(folder)
     card = read_card(folder)
-    if card["kind"] not in POLICIES:
-        raise unknown("policy", card["kind"], POLICIES)
+    if card.get("kind") not in POLICIES:
+        raise unknown("policy", str(card.get("kind")), POLICIES)
     weights = folder / str(card.get("weights_in", ".")) / WEIGHTS
     if not weights.exists():
         raise PdkitError(f"{weights} is missing; copy the whole checkpoint folder or train it again with `pdkit train`.")
-    if sha256(weights) != card["weights_sha256"]:
+    if sha256(weights) != card.get("weights_sha256"):
         raise PdkitError(f"{weights} was truncated or altered (its checksum differs from policy.json); restore it or train it again.")
     try:
         policy = POLICIES[card["kind"]](card["config"])

@@ -20,6 +20,7 @@ from torch import nn
 from ..errors import PdkitError
 from ..tasks.spec import TaskSpec
 from .bet import BeT, focal_loss
+from .lora import merged
 
 EDGE = 0.999  # actions are clipped to this share of their range before atanh (ours; the paper's is not known)
 LOG_STD = (-5.0, 2.0)  # the range to which log_std is squashed, as the lesson's small actor does
@@ -66,9 +67,10 @@ class BeTForSAC(BeT):
             parameter.requires_grad_("lora_" in name or name.startswith("spread."))
 
     def with_lora(self, rank: int) -> BeTForSAC:
-        """A copy with adapters of this rank, which start at zero: it acts as this one does. Rank 0: a plain copy."""
-        plain = BeTForSAC(self.config)
-        plain.load_state_dict(self.state_dict())
+        """A copy with new adapters of this rank, which start at zero: it acts as this one does, whose own adapters, if it has any, become
+        part of the plain weights. Rank 0: a plain copy, all of whose weights train."""
+        plain = BeTForSAC(self.config | {"lora": 0})
+        plain.load_state_dict((merged(self) if self.config["lora"] else self).state_dict())
         plain.config = self.config | {"lora": rank}
         if rank:
             plain._add_lora(rank)

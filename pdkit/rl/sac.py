@@ -66,6 +66,10 @@ class SACConfig:
     def __post_init__(self):
         if self.num_critics < 1 or self.actor_lr <= 0 or self.critic_lr <= 0 or not 0 < self.tau <= 1 or not 0 <= self.average < 1:
             raise PdkitError("SAC needs num_critics >= 1, positive learning rates, tau in (0, 1] and average in [0, 1).")
+        if self.hidden < 1 or self.layers < 1 or self.actor_every < 1 or self.init_temperature <= 0 or self.grad_clip <= 0:
+            raise PdkitError("SAC needs hidden, layers and actor_every of 1 or more, and init_temperature and grad_clip above 0.")
+        if not self.log_std_range[0] < self.log_std_range[1] or self.residual_penalty < 0:
+            raise PdkitError("SAC needs a log_std_range whose first number is the smaller one, and residual_penalty of 0 or more.")
         if not 0 <= self.target_subset <= self.num_critics or self.critic_warmup < 0:
             raise PdkitError("SAC needs target_subset from 0 to num_critics, and critic_warmup of 0 or more.")
         if self.actor_value not in ACTOR_VALUES:
@@ -99,7 +103,8 @@ class SAC:
         if c.compile:
             self.critics.compile()
             self.targets.compile()
-            self.actor.heads = torch.compile(self.actor.heads)
+            for part in self.actor.children():  # in place: a compiled method would stay this actor's own in every copy
+                part.compile()
         self.log_temperature = torch.full((), math.log(c.init_temperature), device=device, requires_grad=c.autotune)
         self.target_entropy = -c.target_entropy_scale * act_dim
         self.actor_optimizer = torch.optim.Adam([p for p in self.actor.parameters() if p.requires_grad], lr=c.actor_lr, fused=True)

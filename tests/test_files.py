@@ -1,0 +1,58 @@
+"""Files and folders are replaced whole or not at all, and nothing that is not ours."""
+import os
+import subprocess
+import sys
+
+import pytest
+
+from pdkit.errors import PdkitError
+from pdkit.files import atomic_folder, check_replaceable, recover
+
+
+def save(folder, text):
+    with atomic_folder(folder) as temporary:
+        (temporary / "policy.json").write_text(text)
+
+
+def test_a_folder_of_ours_is_replaced_whole(tmp_path):
+    save(tmp_path / "p", "one")
+    (tmp_path / "p" / "more").write_text("x")
+    save(tmp_path / "p", "two")
+    assert [path.name for path in (tmp_path / "p").iterdir()] == ["policy.json"]
+    assert (tmp_path / "p" / "policy.json").read_text() == "two" and len(list(tmp_path.iterdir())) == 1
+
+
+@pytest.mark.parametrize("given", ["thesis", "."])
+def test_a_folder_with_something_else_is_left_as_it_is(tmp_path, monkeypatch, given):
+    (tmp_path / "thesis").mkdir()
+    (tmp_path / "thesis" / "1.tex").write_text("x")
+    monkeypatch.chdir(tmp_path)
+    for refused in (lambda: save(given, "one"), lambda: check_replaceable(given, "policy.json")):
+        with pytest.raises(PdkitError, match="holds something else"):
+            refused()
+    assert (tmp_path / "thesis" / "1.tex").read_text() == "x" and len(list(tmp_path.iterdir())) == 1
+
+
+def test_an_empty_folder_may_be_used_and_a_file_and_the_root_may_not(tmp_path):
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "file").write_text("x")
+    save(tmp_path / "empty", "one")
+    check_replaceable(tmp_path / "new", "policy.json")
+    with pytest.raises(PdkitError, match="is a file"):
+        check_replaceable(tmp_path / "file", "policy.json")
+    with pytest.raises(PdkitError, match="cannot be replaced"):
+        save("/", "one")
+
+
+def test_what_a_killed_process_moved_away_is_put_back(tmp_path):
+    """Killed between the two renames: only the old folder, under another name, and the new one, under a third, are left."""
+    killed = subprocess.run([sys.executable, "-c", "import os; print(os.getpid())"], capture_output=True, text=True, check=True)
+    for name, text in (("old-", "old"), ("", "new")):
+        folder = tmp_path / f"checkpoint.tmp-{name}{killed.stdout.strip()}"
+        folder.mkdir()
+        (folder / "state.json").write_text(text)
+    alive = tmp_path / f"checkpoint.tmp-{os.getpid()}"
+    alive.mkdir()
+    recover(tmp_path / "checkpoint")
+    assert (tmp_path / "checkpoint" / "state.json").read_text() == "old"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["checkpoint", alive.name]
