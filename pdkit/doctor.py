@@ -82,7 +82,8 @@ def check_packages(environment: Path | None = None) -> list[Check]:
 
 def data_files() -> list[Path]:
     """The bundled files that checksums.json covers: demonstrations, checkpoints and recorded results."""
-    return sorted(p for part in ("demos", "checkpoints", "results") for p in (DATA / part).rglob("*") if p.is_file())
+    found = (path for part in ("demos", "checkpoints", "results") for path in (DATA / part).rglob("*"))
+    return sorted(path for path in found if path.is_file() and not path.name.startswith("."))
 
 
 def check_data() -> list[Check]:

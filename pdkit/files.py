@@ -55,7 +55,7 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
 
     Raises PdkitError, too, when something else stands there: a folder that is not empty and has none of the new one's files.
     """
-    path = Path(os.path.abspath(path))
+    path = Path(os.path.realpath(path))
     if path == path.parent:
         raise PdkitError(f"{path} cannot be replaced; name a folder below it.")
     temporary = path.with_name(f"{path.name}.tmp-{os.getpid()}")
@@ -80,16 +80,20 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
 
 def check_replaceable(path: str | Path, *names: str) -> None:
     """Raises PdkitError for a folder that holds something, but none of the files `names`, by which it would be known as one of ours."""
-    path = Path(os.path.abspath(path))
-    if path.exists() and not path.is_dir():
-        raise PdkitError(f"{path} is a file; name another folder.")
-    if path.exists() and any(path.iterdir()) and not any((path / name).exists() for name in names):
+    path = Path(os.path.realpath(path))
+    try:
+        if path.exists() and not path.is_dir():
+            raise PdkitError(f"{path} is a file; name another folder.")
+        foreign = path.exists() and any(path.iterdir()) and not any((path / name).exists() for name in names)
+    except OSError as error:
+        raise _told(error, path) from error
+    if foreign:
         raise PdkitError(f"{path} holds something else (no {' or '.join(sorted(names))}); name another folder, or an empty one.")
 
 
 def recover(path: str | Path) -> None:
     """Put back the folder at `path` that a killed process had moved away for a new one, and remove what such processes left beside it."""
-    path = Path(os.path.abspath(path))
+    path = Path(os.path.realpath(path))
     left = [part for part in path.parent.glob(f"{path.name}.tmp-*") if part.is_dir() and not _alive(part.name.rpartition("-")[2])]
     old = [part for part in left if part.name.startswith(f"{path.name}.tmp-old-")]
     if old and not path.exists():
@@ -99,6 +103,9 @@ def recover(path: str | Path) -> None:
 
 
 def _alive(pid: str) -> bool:
+    """Whether another process has this number. Our own was, before we began to write, a dead one's: a restarted container counts anew."""
+    if pid == str(os.getpid()):
+        return False
     try:
         os.kill(int(pid), 0)
     except (ProcessLookupError, ValueError):

@@ -3,7 +3,6 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
-import os
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -142,14 +141,15 @@ def _alone() -> Iterator[None]:
     folder = DATA / "results"
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        handle = os.open(folder, os.O_RDONLY)
+        handle = open(folder / ".lock", "a")
     except OSError as error:
         raise PdkitError(f"Cannot record in {folder}: {error.strerror}.") from None
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX)
+    with handle:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX)
+        except OSError as error:
+            raise PdkitError(f"Cannot record in {folder}, which cannot be locked: {error.strerror}.") from None
         yield
-    finally:
-        os.close(handle)
 
 
 def _whole(table: pd.DataFrame) -> pd.DataFrame:

@@ -2,6 +2,7 @@
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -44,14 +45,33 @@ def test_an_empty_folder_may_be_used_and_a_file_and_the_root_may_not(tmp_path):
         save("/", "one")
 
 
-def test_what_a_killed_process_moved_away_is_put_back(tmp_path):
-    """Killed between the two renames: only the old folder, under another name, and the new one, under a third, are left."""
+def test_a_link_stays_and_what_it_leads_to_is_replaced(tmp_path):
+    save(tmp_path / "disk" / "p", "one")
+    (tmp_path / "link").symlink_to(tmp_path / "disk" / "p")
+    save(tmp_path / "link", "two")
+    assert (tmp_path / "link").is_symlink() and (tmp_path / "disk" / "p" / "policy.json").read_text() == "two"
+
+
+def test_a_folder_that_cannot_be_read_is_one_sentence(tmp_path, monkeypatch):
+    def refuse(self):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(Path, "iterdir", refuse)
+    with pytest.raises(PdkitError, match="No permission"):
+        check_replaceable(tmp_path, "policy.json")
+
+
+@pytest.mark.parametrize("own", [False, True])
+def test_what_a_killed_process_moved_away_is_put_back(tmp_path, own):
+    """Killed between the two renames: only the old folder, under another name, and the new one, under a third, are left. In a restarted
+    container this process may have the number of the killed one."""
     killed = subprocess.run([sys.executable, "-c", "import os; print(os.getpid())"], capture_output=True, text=True, check=True)
+    number = os.getpid() if own else int(killed.stdout)
     for name, text in (("old-", "old"), ("", "new")):
-        folder = tmp_path / f"checkpoint.tmp-{name}{killed.stdout.strip()}"
+        folder = tmp_path / f"checkpoint.tmp-{name}{number}"
         folder.mkdir()
         (folder / "state.json").write_text(text)
-    alive = tmp_path / f"checkpoint.tmp-{os.getpid()}"
+    alive = tmp_path / f"checkpoint.tmp-{os.getppid()}"
     alive.mkdir()
     recover(tmp_path / "checkpoint")
     assert (tmp_path / "checkpoint" / "state.json").read_text() == "old"

@@ -1,6 +1,7 @@
 """`pdkit demos`: make demonstrations, or look at what there is."""
 from __future__ import annotations
 
+import shlex
 import sys
 import time
 from pathlib import Path
@@ -96,7 +97,7 @@ def _make(args, source: str) -> Demos:
     folder = Path(args.policy) if args.policy else DATA / "checkpoints" / args.task / "decorated"
     first = 3_000_000 if args.first_seed is None else args.first_seed
     command = f"pdkit demos {args.task} --source agent --num {args.num} --noise {args.noise} --tail {args.tail} --first-seed {first}"
-    command += f" --policy {args.policy}" if args.policy else ""
+    command += f" --policy {shlex.quote(args.policy)}" if args.policy else ""
     how = f"rollouts of a policy decorated by this project, action noise {args.noise}, successes only, cut {args.tail} steps after success"
     return sources.from_agent(load_decorated(folder), args.task, args.num, first_seed=first, noise=args.noise, tail=args.tail, how=how,
                               command=command, progress=Progress(args.num))

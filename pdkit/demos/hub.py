@@ -8,6 +8,7 @@ not a demonstration. Nor is one that starts elsewhere than its seed does here, a
 from __future__ import annotations
 
 import http.client
+import shlex
 import shutil
 import sys
 import urllib.error
@@ -83,7 +84,7 @@ def from_hub(task: str, num: int, file: str | Path | None = None, progress: Call
     if not kept:
         raise PdkitError(f"None of the {tried} episodes of {task} in {path} can be kept: {failed}; use the scripted expert's, "
                          f"`pdkit demos {task}`.")
-    command = f"pdkit demos {task} --source hub --num {num}" + (f" --from {file}" if file else "")
+    command = f"pdkit demos {task} --source hub --num {num}" + (f" --from {shlex.quote(str(file))}" if file else "")
     how = (f"{maker} episodes in the form of ManiSkill's hub, {episodes[0].control} as {spec.make.control}, executed in the fast step, "
            f"each ending at its success; of {tried} read {len(kept)} are kept, {failed}")
     return from_episodes(task, kept, label=LABELS.get(maker, "scripted"), how=how, command=command)
