@@ -17,20 +17,11 @@ from .files import DATA, atomic_file, read_json, write_json
 from .plots import save_small
 from .runs import describe_machine
 from .stats import wilson
-from .sweep_spec import NAME
 from .tasks import TASKS
 from .tasks.partnet import object_set
 
 KEYS = ["task", "recipe", "seed"]  # a row with the same ones is replaced
 OWN = ",partnet"  # behind the recipe of a row on the user's own objects
-
-
-def check_names(record_as: str | None, recipe: str | None = None) -> None:
-    """Raises PdkitError for a record's name that is no word, or a recipe that would leave its folder: before the work, not after."""
-    if record_as is not None and not NAME.fullmatch(record_as):
-        raise PdkitError(f"--record takes a word of letters, digits, dots and dashes, not {record_as!r}.")
-    if recipe is not None and ("/" in recipe or recipe.startswith(".") or not recipe):
-        raise PdkitError(f"--recipe becomes part of a folder's name; {recipe!r} cannot.")
 
 
 def record(name: str, rows: pd.DataFrame, curves: pd.DataFrame) -> None:

@@ -16,7 +16,7 @@ from .sweep_jobs import bases_to_make, finished, make_jobs, missing, unlike_reco
 from .sweep_progress import Progress
 from .sweep_ray import Ray, must_be_installed
 from .sweep_run import LOG, Backend, Job, JobFunction, Local, run_job, run_jobs
-from .sweep_spec import NAME, load_spec
+from .sweep_spec import check_names, load_spec
 
 
 def sweep(jobs: Sequence[Job], backend: Backend, limit: int, function: JobFunction = run_job) -> dict[str, str]:
@@ -96,8 +96,7 @@ def main(argv: list[str]) -> int:
     args = parser.parse_args(argv)
     if args.workers is not None and args.workers < 1:
         raise PdkitError(f"--workers must be at least 1, not {args.workers}.")
-    if args.record is not None and not NAME.fullmatch(args.record):
-        raise PdkitError(f"--record takes a name of letters, digits, dots and dashes, not {args.record!r}.")
+    check_names(args.record)
     if args.ray or args.address:
         must_be_installed()
     spec = load_spec(args.spec)

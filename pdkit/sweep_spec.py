@@ -60,6 +60,14 @@ class Spec:
     checksums: dict[str, str] = field(default_factory=dict)  # by folder: the weights' where the recorded rows were made, if known
 
 
+def check_names(record_as: str | None, recipe: str | None = None) -> None:
+    """Raises PdkitError for a record's name that is no word, or a recipe that would leave its folder: before the work, not after."""
+    if record_as is not None and not NAME.fullmatch(record_as):
+        raise PdkitError(f"--record takes a name of letters, digits, dots and dashes, not {record_as!r}.")
+    if recipe is not None and ("/" in recipe or recipe.startswith(".") or not recipe):
+        raise PdkitError(f"--recipe becomes part of a folder's name; {recipe!r} cannot.")
+
+
 def load_spec(path: str | Path) -> Spec:
     """The spec at `path`. Raises PdkitError for a file that is no spec, an unknown key or a value of the wrong kind."""
     path = Path(path)

@@ -35,9 +35,10 @@ from .pixels.task import ENCODER, encoder_of, pixel_spec, save_visual
 from .policies import POLICIES, Policy, load_policy, save_policy
 from .policies.base import read_card
 from .profiles import PROFILES, differences, flat
-from .recorded import check_names, record
+from .recorded import record
 from .runs import Run, describe_machine, origin
 from .seeds import reported_seeds
+from .sweep_spec import check_names
 from .tasks import get_task
 from .tasks.partnet import object_set
 from .tasks.spec import TaskSpec

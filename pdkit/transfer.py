@@ -22,6 +22,7 @@ from .pixels.task import encoder_of, pixel_spec
 from .policies import DiffusionPolicy, Policy, load_policy
 from .seeds import reported_seeds
 from .stats import wilson
+from .sweep_spec import check_names
 from .tasks import get_task
 from .tasks.spec import TaskSpec
 from .torch_setup import set_threads
@@ -104,7 +105,8 @@ def refuse_to_replace(name: str, tasks: Sequence[str], recipes: Sequence[str], f
     except PdkitError:  # nothing is recorded
         return
     for row in rows[rows.task.isin(tasks) & rows.recipe.isin(recipes)].itertuples():
-        holder = str(row.command).removeprefix("pdkit evaluate ").partition(" --tasks ")[0]
+        words = shlex.split(str(row.command))  # pdkit evaluate FOLDER ..., or what else made the row
+        holder = words[2] if words[:2] == ["pdkit", "evaluate"] else row.command
         if Path(holder).resolve() != Path(folder).resolve():
             raise PdkitError(f"data/results/{name}.csv holds {row.task}'s {row.recipe!r} of {holder}, which recording {folder} would "
                              "replace; choose another name for --record, or take that row out first.")
@@ -150,7 +152,7 @@ def main(argv: list[str]) -> int:
         raise PdkitError("--oracle corrects a base policy as it was made; leave --sampling out.")
     if args.episodes < 1:
         raise PdkitError(f"--episodes must be at least 1, not {args.episodes}.")
-    recorded.check_names(args.record)
+    check_names(args.record)
     set_threads(args.threads)
     kind, policy = load_any(args.policy)
     policy = sampled(policy, settings := parse_settings(args.sampling, "--sampling"))

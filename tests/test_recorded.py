@@ -6,6 +6,7 @@ import pytest
 from pdkit import recorded
 from pdkit.errors import PdkitError
 from pdkit.files import read_json, write_json
+from pdkit.sweep_spec import check_names
 
 
 def test_rows_and_curves_of_one_task_are_loaded(results):
@@ -123,8 +124,8 @@ def test_runs_without_evaluations_can_be_drawn():
 
 @pytest.mark.parametrize("name", ["mine/door", "..", "", ".x"])
 def test_a_record_s_name_is_a_word(name):
-    with pytest.raises(PdkitError, match="--record takes a word"):
-        recorded.check_names(name)
+    with pytest.raises(PdkitError, match="--record takes a name"):
+        check_names(name)
     with pytest.raises(PdkitError, match="--recipe"):
-        recorded.check_names(None, name)
-    recorded.check_names("my-record.2", "fish,features=GPT")
+        check_names(None, name)
+    check_names("my-record.2", "fish,features=GPT")

@@ -83,18 +83,18 @@ def test_another_policys_row_is_not_replaced(tmp_path, monkeypatch, capsys):
     """Neither by an evaluation nor by a corrected one, and before anything is evaluated; the same folder, however written, may."""
     monkeypatch.setattr(recorded, "DATA", tmp_path / "data")
     monkeypatch.chdir(tmp_path)
-    for name in ("one", "two"):
+    for name in ("the one", "two"):
         save_policy(MLP(dict(obs_dim=4, act_dim=2)), tmp_path / name)
     monkeypatch.setattr(transfer, "by_bound", lambda spec, policy, alphas, seeds, progress: pd.DataFrame(
         {"task": spec.name, "alpha": alphas, "episodes": len(seeds), "success": 1.0}))
     for more, row in ([], "base"), (["--oracle", "0"], "mlp,alpha=0"):
         words = ["--tasks", "reach", "--episodes", "2", "--record", "r", *more]
-        assert cli.main(["evaluate", "one", *words]) == cli.main(["evaluate", str(tmp_path / "one"), *words]) == 0
+        assert cli.main(["evaluate", "the one", *words]) == cli.main(["evaluate", str(tmp_path / "the one"), *words]) == 0
         table = (tmp_path / "data" / "results" / "r.csv").read_bytes()
         capsys.readouterr()
         assert cli.main(["evaluate", "two", *words]) == 2
         told = capsys.readouterr()
-        assert f"holds reach's '{row}' of {tmp_path / 'one'}" in told.err and "another name" in told.err and "reach:" not in told.out
+        assert f"holds reach's '{row}' of {tmp_path / 'the one'}" in told.err and "another name" in told.err and "reach:" not in told.out
         assert (tmp_path / "data" / "results" / "r.csv").read_bytes() == table
 
 
