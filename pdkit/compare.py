@@ -22,7 +22,7 @@ from .decorated import Decorated
 from .demos import sources
 from .errors import PdkitError
 from .methods import METHODS
-from .methods.jsrl import JumpStart, load_jump_start
+from .methods.jsrl import JumpStart
 from .methods.ppo import OnPolicy
 from .methods.registry import base_folder, get_method, method_config, trainer_of
 from .pixels.pictures import encoded, pictures_of
@@ -265,11 +265,9 @@ def before_and_after(row: pd.DataFrame) -> tuple[Policy, Policy | Decorated | Ju
     """Of a run by `own_run`: the policy that it was given, the one it ended with, and the seed of a test episode to look at: the first
     whose outcome they do not share, or the first of all."""
     folder = Path(row.folder.item())
-    inside = folder / "decorated"
-    after = load_jump_start(inside) if (inside / "jump_start.json").exists() else load_any(inside)[1]
     tables = [pd.read_csv(folder / f"{name}_episodes.csv") for name in ("base", "decorated")]
     differ = (tables[0].success_once != tables[1].success_once).to_numpy()
-    return load_policy(Path(row.start.item())), after, int(tables[0].seed[differ.argmax()])
+    return load_policy(Path(row.start.item())), load_any(folder / "decorated")[1], int(tables[0].seed[differ.argmax()])
 
 
 def expected_minutes(table: pd.DataFrame, recipe: str, steps: int) -> float | None:

@@ -16,6 +16,7 @@ from .demos.cli import Progress
 from .diffusion_analysis import resampled
 from .errors import PdkitError, unknown
 from .evaluate import evaluate
+from .methods.jsrl import CARD, JumpStart, load_jump_start
 from .oracle import by_bound
 from .pixels.encoders import Encoder
 from .pixels.task import encoder_of, pixel_spec
@@ -31,15 +32,22 @@ from .train import parse_settings
 SAMPLING = ("temperature", "sampler", "sampler_steps", "spacing", "chunk")  # of a Diffusion Policy, whatever it was trained with
 
 
-def load_any(folder: str | Path) -> tuple[str, Policy | Decorated]:
-    """What is saved in `folder`, "base" or "decorated", and the policy. Raises PdkitError when it is neither."""
+def load_any(folder: str | Path) -> tuple[str, Policy | Decorated | JumpStart]:
+    """What is saved in `folder`, "base", "decorated" or "jsrl", and the policy. Raises PdkitError when it is none of them."""
     folder = Path(folder)
+    if (folder / CARD).exists():
+        return "jsrl", load_jump_start(folder)
     if (folder / "decorated.json").exists():
         return "decorated", load_decorated(folder)
     return "base", load_policy(folder)
 
 
-def sampled(policy: Policy | Decorated, settings: dict[str, Any]) -> Policy | Decorated:
+def beneath(policy: Policy | Decorated | JumpStart) -> Policy:
+    """The base policy under a decorated one, JSRL's guide, or a base policy itself."""
+    return policy.base if isinstance(policy, Decorated) else policy.guide if isinstance(policy, JumpStart) else policy
+
+
+def sampled(policy: Policy | Decorated | JumpStart, settings: dict[str, Any]) -> Policy | Decorated | JumpStart:
     """The same weights with other sampling (SAMPLING); raises PdkitError for a policy that has none, or an unknown name."""
     if not settings:
         return policy
@@ -52,7 +60,7 @@ def sampled(policy: Policy | Decorated, settings: dict[str, Any]) -> Policy | De
     return resampled(policy, **settings)
 
 
-def transfer(policy: Policy | Decorated, tasks: Sequence[str], episodes: int, encoder: Encoder | None = None,
+def transfer(policy: Policy | Decorated | JumpStart, tasks: Sequence[str], episodes: int, encoder: Encoder | None = None,
              **options: Any) -> pd.DataFrame:
     """Success on the first `episodes` test seeds of each task, one row a task; `options` go to `evaluate`, `encoder` is what the policy
     sees the tasks through.
@@ -61,7 +69,7 @@ def transfer(policy: Policy | Decorated, tasks: Sequence[str], episodes: int, en
     or one whose observations or actions are not the policy's.
     """
     specs = [pixel_spec(get_task(task), encoder) if encoder else get_task(task) for task in tasks]
-    config = (policy.base if isinstance(policy, Decorated) else policy).config
+    config = beneath(policy).config
     for spec in specs:
         if (config["obs_dim"], config["act_dim"]) != (spec.obs_dim, spec.act_dim):
             raise PdkitError(f"This policy takes {config['obs_dim']} numbers and gives {config['act_dim']}; {spec.name} gives "
@@ -76,16 +84,16 @@ def transfer(policy: Policy | Decorated, tasks: Sequence[str], episodes: int, en
     return pd.DataFrame(rows)
 
 
-def film(policy: Policy | Decorated, spec: TaskSpec, path: str | Path, episodes: int) -> Path:
-    """Write a test episode as a video: of a decorated policy beside its base, the first of `episodes` that only the decorated one solves,
-    if there is one. Raises PdkitError where the task cannot be drawn, or no encoder works.
+def film(policy: Policy | Decorated | JumpStart, spec: TaskSpec, path: str | Path, episodes: int) -> Path:
+    """Write a test episode as a video: of a policy that has one beneath it beside that one, the first of `episodes` that only the upper
+    solves, if there is one. Raises PdkitError where the task cannot be drawn, or no encoder works.
     """
     if reason := video.try_render(spec):
         raise PdkitError(reason)
     path, seeds, apart = Path(path), reported_seeds(episodes), max(2, round(spec.rate / 20))
-    if isinstance(policy, Decorated):
-        pairs = video.contrasts(spec, policy.base, policy, seeds, stride=apart, tries=episodes)
-        clips = pairs[0] if pairs else video.record_all(spec, {"base": policy.base, "decorated": policy}, seeds[0], stride=apart)
+    if (base := beneath(policy)) is not policy:
+        pairs = video.contrasts(spec, base, policy, seeds, stride=apart, tries=episodes)
+        clips = pairs[0] if pairs else video.record_all(spec, {"base": base, "decorated": policy}, seeds[0], stride=apart)
     else:
         clips = video.record_all(spec, {policy.kind: policy}, seeds[0], stride=apart)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -134,12 +142,12 @@ def corrected(kind: str, policy: Policy | Decorated, args: argparse.Namespace) -
 
 def main(argv: list[str]) -> int:
     parser = Parser(prog="pdkit evaluate", description="Success of a saved policy on the test episodes of one task or several.")
-    parser.add_argument("policy", help="folder of a base policy or of a decorated one")
+    parser.add_argument("policy", help="folder of a base policy, of a decorated one or of JSRL's")
     parser.add_argument("--tasks", nargs="+", required=True, help="for example TurnFaucetSource TurnFaucet")
     parser.add_argument("--episodes", type=int, default=100, help="test episodes of each task (default 100)")
     parser.add_argument("--record", help="name under data/results: a row a task is added to NAME.csv")
-    parser.add_argument("--film", metavar="FILE", help="write an episode as FILE (.mp4 or .webp) instead, of a decorated policy one that "
-                                                       "its base does not solve, side by side")
+    parser.add_argument("--film", metavar="FILE", help="write an episode as FILE (.mp4 or .webp) instead, of a decorated policy or "
+                                                       "JSRL's one that its base does not solve, side by side")
     parser.add_argument("--oracle", nargs="+", type=float, metavar="ALPHA", help="success of a base policy that a demonstrator corrects by "
                         "at most so much (0: not at all; times the task's alpha_scale), instead: what a bound allows")
     parser.add_argument("--sampling", nargs="+", metavar="NAME=VALUE", default=[], help="let a Diffusion Policy sample otherwise than it "

@@ -7,6 +7,7 @@ import torch
 from test_online import bet_base
 from worlds import reach_trainer
 
+from pdkit import cli, recorded, transfer
 from pdkit.errors import PdkitError
 from pdkit.evaluate import evaluate, timed
 from pdkit.methods.config import MethodConfig
@@ -164,6 +165,27 @@ def test_the_combined_policy_switches_at_its_horizon(tmp_path):
     assert back.guide_steps == 3 and np.array_equal(back.act(windows, np.array([0, 2, 3, 9])), actions)
     with pytest.raises(PdkitError, match="elapsed"):
         policy.act(windows)
+
+
+def test_evaluate_and_film_know_its_folder(tmp_path, monkeypatch, capsys):
+    """The recipe tells it from a decorated policy; a film shows it beside its guide."""
+    trainer, shown = start(bet_base(act_dropout=False)), []
+    trainer._set_guide_steps(3)
+    trainer.save_policy(trainer.policy, tmp_path / "p")
+    monkeypatch.setattr(transfer, "get_task", lambda name: SPEC)
+    monkeypatch.setattr(recorded, "DATA", tmp_path)
+    assert cli.main(["evaluate", str(tmp_path / "p"), "--tasks", "reach", "--episodes", "20", "--record", "j"]) == 0
+    (row,) = recorded.load("j")[0].itertuples()
+    assert row.recipe == "jsrl" and row.success == success(load_jump_start(tmp_path / "p"), 20)
+    assert cli.main(["evaluate", str(tmp_path / "p"), "--tasks", "reach", "--sampling", "temperature=0"]) == 2
+    assert "this is a JumpStart" in capsys.readouterr().err
+    monkeypatch.setattr(transfer.video, "try_render", lambda spec: None)
+    monkeypatch.setattr(transfer.video, "contrasts", lambda spec, *policies, seeds=(), **options: shown.extend(policies[:2]) or [])
+    monkeypatch.setattr(transfer.video, "record_all", lambda spec, policies, *words, **options: shown.append(list(policies)) or [None])
+    monkeypatch.setattr(transfer.video, "side_by_side", lambda *clips: None)
+    monkeypatch.setattr(transfer.video, "write_video", lambda *words, **options: True)
+    transfer.film(policy := load_jump_start(tmp_path / "p"), SPEC, tmp_path / "f.webp", 2)
+    assert shown == [policy.guide, policy, ["base", "decorated"]]
 
 
 # ---- the whole -------------------------------------------------------------------------------------------------------

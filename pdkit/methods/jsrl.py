@@ -30,6 +30,7 @@ from ..policies.zero import Zero
 from ..seeds import selection_seeds
 
 FORMAT = "pdkit-jump-start-1"
+CARD = "jump_start.json"  # beside guide and learner, in the folder of what was trained
 
 
 def may_advance(scores: list[float], window: int, tolerance: float) -> bool:
@@ -160,15 +161,15 @@ def save_jump_start(policy: JumpStart, folder: str | Path, info: dict | None = N
     with atomic_folder(folder) as temporary:
         save_policy(policy.guide, temporary / "guide")
         save_decorated(learner, temporary / "learner")
-        write_json(temporary / "jump_start.json", {"format": FORMAT, "guide_steps": policy.guide_steps, "info": info or {}})
+        write_json(temporary / CARD, {"format": FORMAT, "guide_steps": policy.guide_steps, "info": info or {}})
 
 
 def load_jump_start(folder: str | Path) -> JumpStart:
     """The policy saved in `folder`. Raises PdkitError when a part is missing, altered or does not fit."""
     folder = Path(folder)
-    card = read_json(folder / "jump_start.json")
+    card = read_json(folder / CARD)
     if not isinstance(card, dict) or card.get("format") != FORMAT or "guide_steps" not in card:
-        raise PdkitError(f"{folder}/jump_start.json is not a {FORMAT} file.")
+        raise PdkitError(f"{folder}/{CARD} is not a {FORMAT} file.")
     learner = load_decorated(folder / "learner")
     learner.actor.register_buffer("guide_steps", torch.tensor(int(card["guide_steps"])))
     return JumpStart(load_policy(folder / "guide"), learner)
