@@ -40,6 +40,8 @@ class PushChair:
     With `cameras` the scenes can be drawn by pdkit/pixels (`render` draws plans of the floor, without a scene).
     """
 
+    slow_to_build = True  # a scene takes longer than an episode: lanes keep it when they are closed
+
     def __init__(self, kind: str, render: bool = False, cameras: bool = False):
         self._can_render, self._cameras = render, cameras
         self._chairs = chairs(kind)
