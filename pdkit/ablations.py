@@ -84,6 +84,13 @@ def grid(table: pd.DataFrame, column: str = "decorated_success") -> pd.DataFrame
     return pd.DataFrame(rows).pivot(index="alpha", columns="H", values="value")
 
 
+def gate_effects(table: pd.DataFrame, H: int = 20_000) -> pd.DataFrame:
+    """Each cell of the grid less the one of its own bound and this `H`, seed by seed: rows as in `differences`, by bound, then H."""
+    cells = sorted({(float(m[1]), int(m[2])) for m in map(CELL.fullmatch, table.recipe) if m})
+    rows = [differences(table, {cell_name(alpha, h): f"alpha {alpha:g}, H {h:,}"}, cell_name(alpha, H)) for alpha, h in cells if h != H]
+    return pd.concat([row for row in rows if len(row)] or [differences(table, {})], ignore_index=True)
+
+
 def action_scales(demos: Demos) -> dict[str, float]:
     """Two readings of "the action scale observed in the demonstration dataset" (appendix B.2), averaged over action dimensions and
     clipped to [-1, 1]: the size of an action, mean |a|, and of a step between two, mean |a_t - a_(t-1)| inside an episode. Dimensions

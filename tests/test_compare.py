@@ -179,6 +179,16 @@ def test_the_grid():
         ablations.grid(runs("critic_input=concat", [0.9]))
 
 
+def test_a_gate_is_held_against_that_of_its_own_bound():
+    cells = {"alpha=0.1,H=0": [0.1, 0.2, 0.3], "alpha=1.0,H=0": [0.5, 0.6], "alpha=0.1,H=20000": [0.3, 0.3, 0.3],
+             "alpha=1.0,H=20000": [0.4, 0.4], "alpha=0.1,H=40000": [0.4, 0.4, 0.4], "alpha=0.3,H=0": [0.9], "critic_input=concat": [0.9]}
+    table = pd.concat([runs(name, values) for name, values in cells.items()])
+    rows = ablations.gate_effects(table)
+    assert rows.label.tolist() == ["alpha 0.1, H 0", "alpha 0.1, H 40,000", "alpha 1, H 0"]  # 0.3 has nothing to be held against
+    assert rows.value.tolist() == pytest.approx([-0.1, 0.1, 0.15]) and rows.seeds.tolist() == [3, 3, 2] and np.isnan(rows.low[2])
+    assert ablations.gate_effects(runs("critic_input=concat", [0.9])).empty
+
+
 def test_action_scales_stay_inside_an_episode():
     parts = [np.array([[0.5], [-2.0]]), np.array([[1.0], [0.0]])]
     demos = SimpleNamespace(task="Door", actions=np.concatenate(parts), episodes=lambda: [{"actions": part} for part in parts])
