@@ -137,8 +137,7 @@ def test_warm_start(tmp_path):
     result = run("07", tmp_path)
     assert result["verdict"] in ("reproduced", "partly", "not") and set(result["runs"]) == {"warm", "vanilla", "fixed"}
     assert result["runs"]["fixed"]["temperature"] == pytest.approx(1)
-    growth = {arm["arm"]: arm["growth"] for arm in result["interventions"]}
-    assert growth["-9"] > 1 > growth["-1"] and result["cause"] == "side"
+    assert result["interventions"]["-9"]["growth"] > 1 > result["interventions"]["-1"]["growth"] and result["cause"] == "side"
     assert (tmp_path / "updates.csv").exists() and result["exercise_solved"] is False
 
 

@@ -156,8 +156,13 @@ def _() -> Finding:
 
 @measures("PPO fine-tuning performs poorly with all three")
 def _() -> Finding:
-    """Poorly: even the best of the three ends below the base policy."""
+    """Poorly: even the best of the three ends below the base policy. Beside them, and not judged: the comparison's longer runs, with the
+    MLP alone."""
     interval, values, told = _largest_gain("ppo_finetune", ["mlp", "shared", "separate"])
+    with contextlib.suppress(TooLittle):
+        board, _ = recorded("leaderboard")
+        _, longer = difference(*(by_seed(board, "ppo_finetune", column) for column in ("decorated_success", "base_success")))
+        told += f"; not judged: mlp in the longer runs of leaderboard {signed(average(longer))}{task_by_task(longer, signed)}"
     return finding("q_architectures", values, told, f"the best one: {points(interval)}", judged_over_tasks(-values))
 
 
