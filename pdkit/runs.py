@@ -21,13 +21,14 @@ PACKAGES = ("torch", "numpy", "gymnasium", "gymnasium-robotics", "mujoco", "mani
 NO_MATTER = {"env_workers", "eval_workers", "checkpoint_every"}  # results do not depend on these: a run may go on with others
 
 
-def _git() -> str:
+def commit() -> str:
+    """The commit of this working copy, "+changes" behind it where files differ from it; "unknown" outside git."""
     try:
         head = ["git", "rev-parse", "HEAD"]
-        commit = subprocess.run(head, cwd=ROOT, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
+        found = subprocess.run(head, cwd=ROOT, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
         status = ["git", "status", "--porcelain"]
         dirty = subprocess.run(status, cwd=ROOT, capture_output=True, text=True, check=True, timeout=10).stdout
-        return commit + ("+changes" if dirty.strip() else "")
+        return found + ("+changes" if dirty.strip() else "")
     except (OSError, subprocess.SubprocessError):
         return "unknown"
 
@@ -44,7 +45,7 @@ def describe_machine() -> dict[str, Any]:
             versions[name] = None
     return {"python": platform.python_version(), "system": f"{platform.system()} {platform.machine()}", "cores": cores(),
             "torch_threads": torch.get_num_threads(),
-            "cuda": torch.cuda.is_available() and torch.cuda.get_device_name(), "versions": versions, "git": _git()}
+            "cuda": torch.cuda.is_available() and torch.cuda.get_device_name(), "versions": versions, "git": commit()}
 
 
 def origin(base_card: dict[str, Any], demos: Any | None, encoder: Any | None = None, objects: str = "") -> dict[str, Any]:

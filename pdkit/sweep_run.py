@@ -72,6 +72,8 @@ JobFunction = Callable[[Job], dict[str, Any]]
 
 def run_job(job: Job) -> dict[str, Any]:
     """Run the job's command to its end and return its row, its curve and the settings it ran with. Raises PdkitError."""
+    from .runs import commit
+
     out, path = ROOT / job.out if job.out else job.folder / "run", os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
     with open(job.folder / LOG, "ab") as log:
         start = log.tell()
@@ -88,7 +90,8 @@ def run_job(job: Job) -> dict[str, Any]:
             process.kill()
     if code:
         raise PdkitError(_killed_by(-code) if code < 0 else _last_line(job.folder / LOG, start))
-    return {"train": _trained, "base": _imitated, "notebook": _played}[job.kind](job, out)
+    made = {"train": _trained, "base": _imitated, "notebook": _played}[job.kind](job, out)
+    return made | {"row": made["row"] | {"commit": commit()}}
 
 
 def _trained(job: Job, out: Path) -> dict[str, Any]:

@@ -106,6 +106,18 @@ def test_a_manifest_of_one_machine_is_taken_over(results, monkeypatch):
     assert [machine["cores"] for machine in read_json(results / "x_manifest.json")["machines"]] == [4, 2]
 
 
+def test_every_row_tells_the_commit_that_made_it(results, monkeypatch):
+    """That of its own run where it brings one, and old rows keep theirs."""
+    row = {"task": "Door", "recipe": "x", "command": "pdkit"}
+    for now, brought in (("one", {}), ("two", {"commit": "zero"}), ("three", {})):
+        monkeypatch.setattr(recorded, "commit", lambda now=now: now)
+        recorded.record("x", pd.DataFrame([row | {"seed": len(now)} | brought]), pd.DataFrame())
+        if now == "one":  # as if recorded before there was such a column
+            path = results / "x.csv"
+            pd.read_csv(path).assign(seed=9).drop(columns="commit").to_csv(path, index=False)
+    assert recorded.load("x")[0].set_index("seed").commit.fillna("").to_dict() == {3: "zero", 5: "three", 9: ""}
+
+
 def test_counts_are_kept_to_the_last_digit_where_some_rows_lack_them(results):
     row = {"task": "Door", "recipe": "x", "command": "pdkit"}
     recorded.record("counts", pd.DataFrame([row | {"seed": 0, "steps": 1_234_567, "rate": 0.123456789}, row | {"seed": 1}]), pd.DataFrame())

@@ -24,6 +24,7 @@ from pdkit.methods.registry import method_config
 from pdkit.policies import load_policy
 from pdkit.policies.base import read_card
 from pdkit.profiles import flat, online_config
+from pdkit.runs import commit
 from pdkit.sweep_progress import Progress
 from pdkit.sweep_run import Job, Local, run_jobs
 from pdkit.sweep_spec import load_spec
@@ -336,6 +337,7 @@ def test_a_real_grid_of_two_trainings_is_recorded_and_skipped_the_second_time(tm
     table, curves = pd.read_csv(results / "tiny.csv"), pd.read_csv(results / "tiny_curves.csv")
     assert list(table.recipe) == ["alpha=0.1", "alpha=0.3"] and (table.env_steps >= 600).all() and (table.episodes == 2).all()
     assert list(table.sweep) == ["pdkit sweep spec.json --record tiny"] * 2  # no folder of this machine
+    assert table.commit.str.removesuffix("+changes").tolist() == [commit().removesuffix("+changes")] * 2
     assert table.command[1] == ("pdkit train decorated Door --method policy_decorator --profile smoke --recipe alpha=0.3 --episodes 2 "
                                 "--seeds 0 --set alpha=0.3")
     assert set(curves.recipe) == set(table.recipe) and curves.success_once.notna().sum() == 2
