@@ -4,8 +4,20 @@
 
 No base action is added and nothing is gated: alpha = 1, H = 0 over a policy that does nothing. Critics are small MLPs that see the
 last observation; the actor sees the whole window, so whole windows are stored. With another `critic_backbone` critics, too, see the
-window, through a transformer (pdkit/rl/gpt_critic.py; appendix F.5.1). Numbers: adapters of rank 8 on attention and regression head (the
-paper gives none), batches of 64 and an update every eight steps in the lesson profile, those of the paper's code in the paper profile.
+window, through a transformer (pdkit/rl/gpt_critic.py; appendix F.5.1). Adapters have rank 8, on attention and regression head (the
+paper gives none). Other numbers (the paper's code: facts.md 1.3; pdkit/profiles.py holds all):
+
+                            lesson, Door    StackCube    paper
+    steps between updates              8            8        4
+    batch                             64           64    1,024
+    rate of actor, critics    6e-4, 1e-3   3e-4, 3e-4     1e-4
+    gamma, tau                0.97, 0.01   0.98, 0.01   0.97, 0.01
+    steps of reward                    5            5        1
+    first temperature               0.01         0.01        1
+    target entropy              -act_dim   -3 act_dim   -act_dim
+
+RLPD's cut-down (appendix B.5) has half of each batch from demonstrations and LayerNorm in its critics, in each profile (fine-tuning has
+that in the lesson alone), and all else the same.
 """
 from __future__ import annotations
 
