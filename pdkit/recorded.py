@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from .errors import PdkitError
 from .files import DATA, atomic_file, read_json, write_json
 from .plots import save_small
-from .runs import commit, describe_machine
+from .runs import describe_machine
 from .stats import wilson
 from .tasks import TASKS
 from .tasks.partnet import object_set
@@ -27,13 +27,12 @@ OWN = ",partnet"  # behind the recipe of a row on the user's own objects
 def record(name: str, rows: pd.DataFrame, curves: pd.DataFrame) -> None:
     """Add rows to data/results/NAME.csv and, where there are curves, NAME_curves.csv, and draw a picture a task of trainings.
 
-    A row tells the commit that made it, in the column `commit`: that of now where it does not yet. The manifest tells how to make all
-    of it again (the column `sweep` of rows that have one, else `command`) and which machines have recorded here, this one last; a
-    row's `cores` hint at which of them made it. On the user's own objects (PDKIT_PARTNET) a recipe is written as RECIPE,partnet,
-    beside those of generated ones; `load` gives the rows of the objects that are set.
+    The manifest tells how to make all of it again (the column `sweep` of rows that have one, else `command`) and which machines have
+    recorded here, this one last; a row's `cores` hint at which of them made it, and its `commit` is that of its own run. On the user's
+    own objects (PDKIT_PARTNET) a recipe is written as RECIPE,partnet, beside those of generated ones; `load` gives the rows of the
+    objects that are set.
     """
     folder, tables = DATA / "results", []
-    rows = rows if "commit" in rows or rows.empty else rows.assign(commit=commit())
     rows, curves = (table.assign(recipe=table.recipe.where(~_on_own_objects(table), table.recipe + OWN)) if len(table) else table
                     for table in (rows, curves))
     with _alone():

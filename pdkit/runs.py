@@ -22,11 +22,11 @@ NO_MATTER = {"env_workers", "eval_workers", "checkpoint_every"}  # results do no
 
 
 def commit() -> str:
-    """The commit of this working copy, "+changes" behind it where files differ from it; "unknown" outside git."""
+    """The commit of this working copy, "+changes" behind it where files differ from it, recorded results aside; "unknown" outside git."""
     try:
         head = ["git", "rev-parse", "HEAD"]
         found = subprocess.run(head, cwd=ROOT, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
-        status = ["git", "status", "--porcelain"]
+        status = ["git", "status", "--porcelain", "--", ".", ":(exclude)data/results"]
         dirty = subprocess.run(status, cwd=ROOT, capture_output=True, text=True, check=True, timeout=10).stdout
         return found + ("+changes" if dirty.strip() else "")
     except (OSError, subprocess.SubprocessError):

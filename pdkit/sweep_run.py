@@ -72,9 +72,10 @@ JobFunction = Callable[[Job], dict[str, Any]]
 
 def run_job(job: Job) -> dict[str, Any]:
     """Run the job's command to its end and return its row, its curve and the settings it ran with. Raises PdkitError."""
-    from .runs import commit
+    from .runs import commit  # brings pandas, which the scheduler does without
 
     out, path = ROOT / job.out if job.out else job.folder / "run", os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
+    code_of = {"commit": commit()}  # before the command, which takes hours, loads it
     with open(job.folder / LOG, "ab") as log:
         start = log.tell()
         process = subprocess.Popen([sys.executable, "-m", "pdkit", *job.words, "--out", str(out)], cwd=ROOT, stdin=subprocess.DEVNULL,
@@ -91,7 +92,7 @@ def run_job(job: Job) -> dict[str, Any]:
     if code:
         raise PdkitError(_killed_by(-code) if code < 0 else _last_line(job.folder / LOG, start))
     made = {"train": _trained, "base": _imitated, "notebook": _played}[job.kind](job, out)
-    return made | {"row": made["row"] | {"commit": commit()}}
+    return made | {"row": code_of | made["row"]}
 
 
 def _trained(job: Job, out: Path) -> dict[str, Any]:
@@ -100,14 +101,15 @@ def _trained(job: Job, out: Path) -> dict[str, Any]:
     folder = out / "{task}-{recipe}-seed{seed}".format(**job.labels)
     manifest = read_json(folder / "manifest.json")
     curve = json.loads(pd.read_csv(folder / "metrics.csv").to_json(orient="records", double_precision=15))
-    return {"row": manifest["results"], "curve": curve, "settings": manifest["parameters"]}
+    return {"row": manifest["results"] | {"commit": manifest["machine"]["git"]}, "curve": curve, "settings": manifest["parameters"]}
 
 
 def _imitated(job: Job, out: Path) -> dict[str, Any]:
     card = read_json(out / "policy.json")
     info = card["info"]
     row = {"policy": card["kind"], "demos": info["demos"], "train_minutes": round(info["seconds"] / 60, 2),
-           "cores": info["machine"]["cores"], "device": info["device"], "iteration": info["selected"]["iteration"], **info["test"]}
+           "cores": info["machine"]["cores"], "device": info["device"], "iteration": info["selected"]["iteration"],
+           "commit": info["machine"]["git"], **info["test"]}
     return {"row": row, "curve": [], "settings": base_settings(card)}
 
 

@@ -20,7 +20,7 @@ from .demos import Demos, sources
 from .demos.cli import Progress
 from .errors import PdkitError
 from .evaluate import evaluate
-from .files import DATA, atomic_file, check_replaceable, runs_root, write_json
+from .files import DATA, atomic_file, check_replaceable, read_json, runs_root, write_json
 from .imitate import configured, imitate
 from .methods import METHODS
 from .methods.registry import base_folder as shipped_base
@@ -176,7 +176,7 @@ def _decorated(args) -> int:
         if encoder and demos:
             demos = encoded(demos, pictures_of(demos, Progress(demos.num, "drawn")), encoder)
         row = decorate(config, base, demos, out, args.episodes, started_from, args.tensorboard, encoder)
-        row |= {"recipe": args.recipe, "command": command_of(args, seed)}
+        row |= {"recipe": args.recipe, "command": command_of(args, seed), "commit": read_json(out / "manifest.json")["machine"]["git"]}
         print(", ".join(f"{k} {v}" for k, v in row.items()), flush=True)
         if args.record:
             curves = pd.read_csv(out / "metrics.csv").assign(task=args.task, seed=seed, recipe=args.recipe)

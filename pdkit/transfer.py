@@ -21,6 +21,7 @@ from .oracle import by_bound
 from .pixels.encoders import Encoder
 from .pixels.task import encoder_of, pixel_spec
 from .policies import DiffusionPolicy, Policy, load_policy
+from .runs import commit
 from .seeds import reported_seeds
 from .stats import wilson
 from .sweep_spec import check_names
@@ -92,8 +93,9 @@ def film(policy: Policy | Decorated | JumpStart, spec: TaskSpec, path: str | Pat
         raise PdkitError(reason)
     path, seeds, apart = Path(path), reported_seeds(episodes), max(2, round(spec.rate / 20))
     if (base := beneath(policy)) is not policy:
-        pairs = video.contrasts(spec, base, policy, seeds, stride=apart, tries=episodes)
-        clips = pairs[0] if pairs else video.record_all(spec, {"base": base, "decorated": policy}, seeds[0], stride=apart)
+        name = "JSRL" if isinstance(policy, JumpStart) else "decorated"
+        pairs = video.contrasts(spec, base, policy, seeds, stride=apart, tries=episodes, name=name)
+        clips = pairs[0] if pairs else video.record_all(spec, {"base": base, name: policy}, seeds[0], stride=apart)
     else:
         clips = video.record_all(spec, {policy.kind: policy}, seeds[0], stride=apart)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -120,7 +122,7 @@ def refuse_to_replace(name: str, tasks: Sequence[str], recipes: Sequence[str], f
                              "replace; choose another name for --record, or take that row out first.")
 
 
-def corrected(kind: str, policy: Policy | Decorated, args: argparse.Namespace) -> int:
+def corrected(kind: str, policy: Policy | Decorated | JumpStart, args: argparse.Namespace) -> int:
     """`pdkit evaluate --oracle`: success by the bound (pdkit/oracle.py), printed, and recorded if asked, a row a task and bound."""
     if kind != "base" or encoder_of(args.policy):
         raise PdkitError("--oracle corrects a base policy that is told the state; name the folder of one.")
@@ -136,7 +138,8 @@ def corrected(kind: str, policy: Policy | Decorated, args: argparse.Namespace) -
             own = shlex.quote(args.policy)
             again = [f"pdkit evaluate {own} --tasks {task} --episodes {args.episodes} --oracle {alpha:g} --record {args.record}"
                      for alpha in rows.alpha]
-            recorded.record(args.record, rows.assign(policy=policy.kind, recipe=named, seed=0, command=again), pd.DataFrame())
+            recorded.record(args.record, rows.assign(policy=policy.kind, recipe=named, seed=0, command=again, commit=commit()),
+                            pd.DataFrame())
     return 0
 
 
@@ -181,5 +184,5 @@ def main(argv: list[str]) -> int:
         asked = ["--sampling", *args.sampling] if args.sampling else []
         command = shlex.join(["pdkit", "evaluate", args.policy, "--tasks", *args.tasks, "--episodes", str(args.episodes), *asked,
                               "--record", args.record])
-        recorded.record(args.record, rows.assign(recipe=recipe, seed=0, command=command), pd.DataFrame())
+        recorded.record(args.record, rows.assign(recipe=recipe, seed=0, command=command, commit=commit()), pd.DataFrame())
     return 0

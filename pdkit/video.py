@@ -176,8 +176,8 @@ def trace(spec: TaskSpec, policy: Decorated, seed: int, *, steps: int | None = N
 
 
 def contrasts(spec: TaskSpec, base: Policy, decorated: Decorated, seeds: Sequence[int], count: int = 1, *,
-              tries: int = 6, steps: int | None = None, stride: int = 3) -> list[tuple[Clip, Clip]]:
-    """Up to `count` pairs of episodes from `seeds` that the base fails and the decorated policy solves, with frames.
+              tries: int = 6, steps: int | None = None, stride: int = 3, name: str = "decorated") -> list[tuple[Clip, Clip]]:
+    """Up to `count` pairs of episodes from `seeds` that the base fails and the decorated policy, labelled `name`, solves, with frames.
 
     Each is run again, alone: matrix products round differently for one lane than for fifty, and a contact can turn that
     into another outcome, so an episode that now comes out otherwise is passed over (at most `tries` are run).
@@ -189,7 +189,7 @@ def contrasts(spec: TaskSpec, base: Policy, decorated: Decorated, seeds: Sequenc
         (failed,) = record_all(spec, {"base": base}, seed, steps=steps, stride=stride)
         if failed.success.any():
             continue
-        (solved,) = record_all(spec, {"decorated": decorated}, seed, steps=steps, stride=stride)
+        (solved,) = record_all(spec, {name: decorated}, seed, steps=steps, stride=stride)
         if solved.success.any():
             pairs.append((failed, solved))
     return pairs

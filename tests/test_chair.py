@@ -13,7 +13,8 @@ from pdkit.demos import save_demos, sources
 from pdkit.demos.chair_expert import PushChairExpert
 from pdkit.demos.experts import scripted_episodes
 from pdkit.errors import PdkitError
-from pdkit.tasks import chair_assets, get_task
+from pdkit.evaluate import evaluate
+from pdkit.tasks import chair_assets, get_task, lanes
 from pdkit.tasks.chair import PushChair, StockPushChairSource, make_chair_env
 from pdkit.tasks.chair_assets import Chair, chairs, generated_chair
 from pdkit.tasks.chair_body import chair_start, solved
@@ -156,6 +157,31 @@ def test_same_seed_and_actions_repeat_whatever_came_before(fast):
     for seed in rng.integers(8, size=14):
         stop = rng.integers(1, len(episodes[seed]) + 1)
         np.testing.assert_array_equal(play(fast, seed, episodes[seed][:stop])[0], alone[seed][: stop + 1], err_msg=f"seed {seed}")
+
+
+def test_a_second_evaluation_builds_no_scene_and_gives_the_same(monkeypatch):
+    """In what the first left behind, with other pushes in between: a scene takes longer to build than an episode to run."""
+    spec, built, moved = get_task("PushChairSource"), [], []
+    monkeypatch.setattr("pdkit.tasks.chair.make_chair_env", lambda *words: built.append(words) or make_chair_env(*words))
+    actions = pushing(PushChair("source"), 1, steps=60)
+
+    def pushed(order):
+        step = iter(actions[order])
+
+        def act(windows):
+            moved.append(windows[:, -1, 44:46])  # where the chair stands
+            return np.repeat(next(step)[None, None], len(windows), axis=0)
+
+        return evaluate(spec, act, [1, 2], num_envs=2, max_episode_steps=len(actions))
+
+    lanes.close_spares()
+    built.clear()
+    first, scenes = pushed(slice(None)), len(built)
+    pushed(slice(None, None, -1))
+    again = pushed(slice(None))
+    assert len(built) == scenes == 2 and first.equals(again)
+    assert np.abs(moved[len(actions) - 1][0] - moved[0][0]).max() > 0.05  # the expert did reach its own chair
+    lanes.close_spares()
 
 
 def test_simulations_in_one_process_do_not_disturb_each_other():

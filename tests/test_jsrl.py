@@ -185,7 +185,7 @@ def test_evaluate_and_film_know_its_folder(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(transfer.video, "side_by_side", lambda *clips: None)
     monkeypatch.setattr(transfer.video, "write_video", lambda *words, **options: True)
     transfer.film(policy := load_jump_start(tmp_path / "p"), SPEC, tmp_path / "f.webp", 2)
-    assert shown == [policy.guide, policy, ["base", "decorated"]]
+    assert shown == [policy.guide, policy, ["base", "JSRL"]]
 
 
 # ---- the whole -------------------------------------------------------------------------------------------------------

@@ -106,16 +106,11 @@ def test_a_manifest_of_one_machine_is_taken_over(results, monkeypatch):
     assert [machine["cores"] for machine in read_json(results / "x_manifest.json")["machines"]] == [4, 2]
 
 
-def test_every_row_tells_the_commit_that_made_it(results, monkeypatch):
-    """That of its own run where it brings one, and old rows keep theirs."""
+def test_a_row_keeps_the_commit_of_its_own_run_and_older_ones_have_none(results):
     row = {"task": "Door", "recipe": "x", "command": "pdkit"}
-    for now, brought in (("one", {}), ("two", {"commit": "zero"}), ("three", {})):
-        monkeypatch.setattr(recorded, "commit", lambda now=now: now)
-        recorded.record("x", pd.DataFrame([row | {"seed": len(now)} | brought]), pd.DataFrame())
-        if now == "one":  # as if recorded before there was such a column
-            path = results / "x.csv"
-            pd.read_csv(path).assign(seed=9).drop(columns="commit").to_csv(path, index=False)
-    assert recorded.load("x")[0].set_index("seed").commit.fillna("").to_dict() == {3: "zero", 5: "three", 9: ""}
+    for seed, brought in ((0, {}), (1, {"commit": "one"}), (2, {"commit": "two"}), (3, {})):
+        recorded.record("x", pd.DataFrame([row | {"seed": seed} | brought]), pd.DataFrame())
+    assert recorded.load("x")[0].commit.fillna("").tolist() == ["", "one", "two", ""]
 
 
 def test_counts_are_kept_to_the_last_digit_where_some_rows_lack_them(results):

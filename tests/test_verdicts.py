@@ -208,7 +208,6 @@ def verdict_of(start):
 
 @pytest.mark.parametrize("start, other, worse", [
     ("A residual policy that sees the observation", "actor_input=obs+base", "reproduced"),
-    ("Reducing H to 0", "alpha=0.1,H=0", "reproduced"),
     ("A critic that sees the sum of base and residual action does better than one that sees both",
      "critic_input=concat,residual_units=bound", "partly"),
     ("A critic that sees the sum of base and residual action does better than one that sees the res",
@@ -221,6 +220,20 @@ def test_taking_a_part_away(results, start, other, worse):
         assert verdict_of(start) == verdict, ends
     write(results, "ablations", runs(GRID, EVEN), runs(other, FAR[:2]))
     assert verdict_of(start) is None
+
+
+@pytest.mark.parametrize("ends, verdict", [(FAR, "reproduced"), ([0.9, 0.9, 0.99], "partly"), ([0.96, 0.97, 0.99], "not")])
+def test_the_gate_is_judged_where_nothing_else_guards(results, ends, verdict):
+    """Behind the lesson's other guards it is told beside, whatever it does there."""
+    bare = [runs("unguarded,H=20000", EVEN), runs("unguarded,H=0", ends)]
+    write(results, "ablations", *bare)
+    assert verdict_of("Reducing H to 0") == verdict
+    write(results, "ablations", *bare, runs(GRID, [0.9] * 3), runs("alpha=0.1,H=0", [0.1] * 3))
+    found = verdicts.find(CLAIMS.claim[CLAIMS.claim.str.startswith("Reducing H to 0")].item())
+    assert found.verdict == verdict
+    assert found.measured.endswith("; not judged: behind the lesson's other guards H 0 10.0 %, H 20,000 90.0 %: -80.0 points")
+    write(results, "ablations", runs(GRID, EVEN), runs("alpha=0.1,H=0", FAR))
+    assert verdict_of("Reducing H to 0") is None
 
 
 @pytest.mark.parametrize("ends, base, verdict", [(CLOSE, 0.5, "partly"), (FAR, 0.4, "not"), (CLOSE, 0.93, "not")])
@@ -291,6 +304,27 @@ def test_unlearning_and_relearning(results):
     assert verdict_of([0, 0, 0.1, 0, 0], [0, 0.1, 0, 0, 0.2]) == ["reproduced", "reproduced"]
     assert verdict_of([0, 0, 0.1, 0, 0], [0.9, 0.8, 0.9, 0.7, 0.2]) == ["reproduced", "not"]
     assert verdict_of([0.6, 0.5, 0.7, 0.6, 0.5], [0.9, 0.8, 0.9, 0.9, 0.9]) == ["not", None]
+
+
+def test_a_variant_of_a_method_is_no_further_method_that_unlearns(results):
+    claim = CLAIMS.claim[CLAIMS.claim.str.startswith("Fine-tuning baselines unlearn")].item()
+    firsts = {"sac_finetune": [0.0] * 3, "rot": [0.1] * 3, "sac_finetune,actor_lr=1e-4": [0.6] * 3}
+    write(results, "leaderboard", *(runs(name, [0.0] * 3) for name in firsts),
+          curves=pd.concat(curve(name, first, [0.0] * 3) for name, first in firsts.items()))
+    found = verdicts.find(claim)
+    assert found.measured.startswith("2 of 2 methods fall")
+    assert "; not counted: sac_finetune,actor_lr=1e-4 " in found.measured and found.measured.endswith("(Door, 3 runs)")
+
+
+def test_longer_runs_of_ppo_are_told_and_not_judged(results):
+    claim = CLAIMS.claim[CLAIMS.claim.str.startswith("PPO fine-tuning performs poorly")].item()
+    kinds = ("mlp", "shared", "separate")
+    write(results, "q_architectures", *(runs(f"ppo_finetune,critic_backbone={kind}", [0.7, 0.8, 0.75]) for kind in kinds))
+    alone = verdicts.find(claim)
+    write(results, "leaderboard", runs("ppo_finetune", [0.0] * 3))
+    found = verdicts.find(claim)
+    assert found.verdict == alone.verdict == "not" and "not judged" not in alone.measured
+    assert found.measured.startswith(alone.measured + "; not judged: mlp in the longer runs of leaderboard -")
 
 
 def test_a_run_that_comes_back_in_between_was_relearned_and_one_that_falls_last_was_not_yet_tried(results):

@@ -235,7 +235,8 @@ def _() -> Finding:
 def _() -> Finding:
     """Success of the first evaluation after learning began, against the start: a method unlearns when it falls by more than 10 points
     (ours, because evaluations and start are measured on other episodes). reproduced: most methods do, of two or more recorded ones;
-    partly: one does. A method at another setting is no further method: it is told beside them."""
+    partly: one does. A method at another setting is no further method: it is told beside them (the
+    one that is recorded was counted first, as the one of five that does not fall)."""
     table, curves = recorded("leaderboard")
     drops, others = {}, {}
     for recipe in FINE_TUNING:
