@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import signal
 from collections.abc import Sequence
 from importlib.util import find_spec
 from typing import Any
@@ -16,6 +17,17 @@ def must_be_installed() -> None:
     """Raises PdkitError where Ray is missing."""
     if find_spec("ray") is None:
         raise PdkitError("Ray is not installed; run `pip install ray`, or leave out --ray and --address to use local workers.")
+
+
+def on_ray(function: JobFunction, job: Job) -> dict[str, Any]:
+    """`work` in a worker of Ray, with the exit codes of what it starts."""
+    _keep_exit_codes()
+    return work(function, job)
+
+
+def _keep_exit_codes() -> None:
+    """Undo what Ray does to a process when it is to end children: SIGCHLD ignored, so that each seems to exit with 0."""
+    signal.signal(signal.SIGCHLD, signal.SIG_DFL)
 
 
 class Ray:
@@ -37,8 +49,9 @@ class Ray:
             ray.init(**own, log_to_driver=False, logging_level="error", runtime_env={"env_vars": ONE_THREAD | {"PYTHONPATH": path}})
         except Exception as error:  # ConnectionError, ValueError, RuntimeError ...: depends on what is wrong with the address
             raise PdkitError(f"Ray does not start at {address or 'this machine'}: {reason(error)[:200].rstrip('.')}.") from None
+        _keep_exit_codes()
         self.limit = workers or max(1, int(ray.cluster_resources().get("CPU", 1)))
-        self._work = ray.remote(num_cpus=1, max_retries=0)(work)
+        self._work = ray.remote(num_cpus=1, max_retries=0)(on_ray)
 
     def start(self, function: JobFunction, job: Job) -> Any:
         return self._work.remote(function, job)

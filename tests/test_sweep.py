@@ -616,7 +616,7 @@ def test_a_cluster_decides_how_many_jobs_run_and_no_job_is_tried_twice(fake_ray)
     assert asked["runtime_env"]["env_vars"]["PYTHONPATH"].startswith(str(sweep_ray.ROOT)) and task == {"num_cpus": 1, "max_retries": 0}
     assert sweep_ray.Ray("10.0.0.1:6379", 3).limit == 3
     assert sweep_ray.Ray(None, None).limit == 6 and fake_ray.calls[-2][1]["address"] == "local" and fake_ray.calls[-2][1]["num_cpus"] == 2
-    assert backend.start(play, "job") == (sweep_ray.work, (play, "job"))
+    assert backend.start(play, "job") == (sweep_ray.on_ray, (play, "job"))
 
 
 def test_a_cluster_that_is_not_there_is_one_sentence(fake_ray):
@@ -648,9 +648,12 @@ def test_the_same_jobs_on_ray_fail_alone_too(tmp_path, monkeypatch):
     pytest.importorskip("ray")
     path = filter(None, (str(Path(__file__).parent), os.environ.get("PYTHONPATH")))  # where Ray's workers find `play`
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(path))
-    jobs = [job(tmp_path, "a", value=3), job(tmp_path, "b", fail=True), job(tmp_path, "c", die=True), job(tmp_path, "d", value=5)]
+    jobs = [job(tmp_path, "a", value=3), job(tmp_path, "b", fail=True), job(tmp_path, "c", die=True), job(tmp_path, "d", value=5),
+            job(tmp_path, "e", command=["sh", "-c", "exit 7"])]
     backend = sweep_ray.Ray(None, 2)
     assert backend.limit == 2
     problems = sweep.sweep(jobs, backend, backend.limit, play)
     assert problems["T b seed 0"] == "It broke; mend it." and "worker was lost" in problems["T c seed 0"] and len(problems) == 2
     assert read_json(jobs[3].result)["row"] == {"value": 5}
+    assert read_json(jobs[4].result)["row"] == {"code": 7}  # by itself Ray makes 0 of every exit code, in this process too
+    assert subprocess.run(["sh", "-c", "exit 7"]).returncode == 7
