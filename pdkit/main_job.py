@@ -36,9 +36,12 @@ def expected_minutes(config: OnlineConfig, episodes: int) -> float:
     an_update = SECONDS_AN_UPDATE * max(size, 0.1) * critics * (1 if config.sac.bf16 else 1.4)
     updates = config.utd * (config.total_steps - config.warmup_steps)
     during = 0 if config.eval_workers or not config.eval_every else config.eval_episodes * config.total_steps // config.eval_every
-    evaluated = during + 2 * episodes
-    steps = config.total_steps + 250 * evaluated
-    return (updates * an_update + steps * SECONDS_A_STEP) / 60 + 0.4
+    return (updates * an_update + (config.total_steps + 250 * during) * SECONDS_A_STEP) / 60 + evaluation_minutes(episodes)
+
+
+def evaluation_minutes(episodes: int) -> float:
+    """Minutes that the two final evaluations of `episodes` take, and the start; as rough."""
+    return 2 * episodes * 250 * SECONDS_A_STEP / 60 + 0.4
 
 
 def duration(minutes: float) -> str:

@@ -15,11 +15,12 @@ from .demos import Demos, sources
 from .errors import PdkitError
 from .files import ROOT, read_json, runs_root
 from .imitate import ImitateConfig, configured, untrained
-from .main_job import expected_minutes
+from .main_job import evaluation_minutes, expected_minutes
 from .methods.registry import base_folder, method_config
 from .policies import Policy, load_policy
 from .policies.base import read_card
 from .profiles import flat
+from .recorded import load
 from .runs import NO_MATTER
 from .sweep_run import Job, base_settings
 from .sweep_spec import Spec
@@ -50,7 +51,7 @@ def make_jobs(spec: Spec) -> list[Job]:
             if mark in seen:
                 raise PdkitError(f"The cells {seen[mark].labels['recipe']} and {job.labels['recipe']} {what}.")
             seen[mark] = job
-    return jobs
+    return _as_recorded(spec, jobs) if spec.kind == "train" and spec.record and not spec.minutes else jobs
 
 
 def _seeds(spec: Spec, cell: dict[str, Any]) -> Sequence[int]:
@@ -81,6 +82,26 @@ def _training(spec: Spec, cell: dict[str, Any], seed: int) -> Job:
     return _job(spec, cell | {"seed": seed}, {"task": cell["task"], "recipe": cell["recipe"], "seed": seed}, words, like=cell["method"],
                 config=flat(config) | weights,
                 minutes=spec.minutes or expected_minutes(config, cell["episodes"]))
+
+
+def _as_recorded(spec: Spec, jobs: list[Job]) -> list[Job]:
+    """These trainings with the minutes that their recipe, or else their method, took for about as many steps where the spec records."""
+    try:
+        rows = load(spec.record)[0]
+    except PdkitError:  # nothing is recorded
+        return jobs
+    if not {"method", "train_minutes", "env_steps"} <= set(rows):
+        return jobs
+    rows = rows.assign(a_step=rows.train_minutes / rows.env_steps)
+    timed = []
+    for job in jobs:
+        steps = job.config["total_steps"]
+        alike = rows[(rows.task == job.labels["task"]) & (rows.method == job.like) & rows.env_steps.between(steps / 2, steps * 2)]
+        same = alike[alike.recipe == job.labels["recipe"]]
+        a_step = (same if len(same) else alike).a_step.median()
+        minutes = a_step * steps + evaluation_minutes(job.parameters["episodes"]) if len(alike) else job.minutes
+        timed.append(replace(job, minutes=minutes))
+    return timed
 
 
 def _base(spec: Spec, cell: dict[str, Any]) -> tuple[Policy, dict[str, str]]:

@@ -19,7 +19,7 @@ from sweep_jobs import job, play
 from pdkit import cli, nb, recorded, sweep, sweep_jobs, sweep_ray, sweep_run
 from pdkit.errors import PdkitError
 from pdkit.files import DATA, ROOT, read_json, write_json
-from pdkit.main_job import expected_minutes
+from pdkit.main_job import evaluation_minutes, expected_minutes
 from pdkit.methods.registry import method_config
 from pdkit.policies import load_policy
 from pdkit.policies.base import read_card
@@ -173,6 +173,25 @@ def test_cells_are_the_grid_and_the_further_ones_by_each_seed(tmp_path):
     assert jobs[6].command == ("pdkit train decorated Door --method policy_decorator --profile smoke --recipe alpha=0.1,H=0 --episodes 2 "
                                "--seeds 1 --set alpha=0.1 H=0")
     assert jobs[-1].config["alpha"] == 1.0 and jobs[0].minutes == expected_minutes(online_config("Door", "smoke", alpha=0.1, H=0), 2)
+
+
+def test_a_training_takes_as_long_as_recorded_ones_of_its_recipe_or_else_method(tmp_path, monkeypatch):
+    monkeypatch.setattr(recorded, "DATA", tmp_path)
+    (tmp_path / "results").mkdir()
+    path = written(tmp_path, record="timed", fixed=SPEC["fixed"] | {"total_steps": 1_000}, grid=None, cells=[
+        {"recipe": "a", "H": 1}, {"recipe": "b", "H": 2}, {"recipe": "c", "method": "residual_rl"},
+        {"recipe": "long", "total_steps": 9_000}])
+    guide = [one.minutes for one in sweep_jobs.make_jobs(load_spec(path))]
+    rows = pd.DataFrame({"task": "Door", "recipe": ["a", "a", "a", "other"], "seed": [0, 1, 2, 0], "method": "policy_decorator",
+                         "train_minutes": [7.0, 8.0, 90.0, 40.0], "env_steps": [1_000, 1_000, 1_000, 2_000]})
+    rows.to_csv(tmp_path / "results" / "timed.csv", index=False)
+    tests = evaluation_minutes(2)
+    a, b, c, long = (one.minutes for one in sweep_jobs.make_jobs(load_spec(path)))
+    assert a == pytest.approx(8 + tests)  # the median of its recipe's, for as many steps
+    assert b == pytest.approx((8 + 20) / 2 + tests)  # of the method's: 7, 8, 20 and 90
+    assert [c, long] == guide[2:]  # another method; far more steps than were ever timed
+    rows.drop(columns="method").to_csv(tmp_path / "results" / "timed.csv", index=False)
+    assert [one.minutes for one in sweep_jobs.make_jobs(load_spec(path))] == guide
 
 
 def test_a_cell_may_have_its_own_seeds(tmp_path):
