@@ -1,4 +1,5 @@
 """The command line: fast, one sentence for each mistake, the right exit codes."""
+import os
 import subprocess
 import sys
 import time
@@ -118,3 +119,17 @@ def test_lab_opens_the_notebooks_folder(monkeypatch, tmp_path):
     (path, argv, folder), = seen
     assert path == sys.executable and argv[1:3] == ["-m", "jupyterlab"] and argv[-2:] == ["--port", "9000"]
     assert folder == str((tmp_path / "notebooks").resolve())
+
+
+@pytest.mark.parametrize("backend, words, sentence", [
+    ("none", ["evaluate", "data/checkpoints/Door/base", "--tasks", "Door", "--episodes", "1"], "MuJoCo does not start with MUJOCO_GL=none"),
+    pytest.param("glfw", ["demos", "Door", "--pixels", "--num", "1"], "MuJoCo cannot draw here with glfw",
+                 marks=pytest.mark.skipif(sys.platform != "linux", reason="elsewhere GLFW needs no display")),
+])
+def test_a_graphics_library_that_does_not_work_is_one_sentence(backend, words, sentence, tmp_path):
+    out = ["--out", str(tmp_path / "seen.safetensors")] if words[0] == "demos" else []
+    environment = {name: value for name, value in os.environ.items() if name not in ("DISPLAY", "WAYLAND_DISPLAY")}
+    done = subprocess.run([sys.executable, "-W", "ignore", "-m", "pdkit", *words, *out], capture_output=True, text=True, cwd=cli.ROOT,
+                          env=environment | {"MUJOCO_GL": backend})
+    assert done.returncode == 2 and done.stderr.startswith(sentence) and done.stderr.count("\n") == 1, done.stderr
+    assert not list(tmp_path.iterdir())

@@ -1,4 +1,4 @@
-"""The scripted expert of PushChair: roll round the chair to its far side, push it home with the torso, let it come to rest."""
+"""The scripted expert of PushChair (ours): roll round the chair to its far side, push it home with the torso, let it come to rest."""
 from __future__ import annotations
 
 import numpy as np

@@ -1,4 +1,4 @@
-"""The scripted expert for TurnFaucet: push a lever, fin or bar of the handle round with closed fingers."""
+"""The scripted expert for TurnFaucet (ours): push a lever, fin or bar of the handle round with closed fingers."""
 from __future__ import annotations
 
 from typing import Any

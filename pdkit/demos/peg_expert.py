@@ -1,4 +1,4 @@
-"""The scripted expert for PegInsertionSide: grasp the peg near its tail, line it up before the hole, push it in."""
+"""The scripted expert for PegInsertionSide (ours): grasp the peg near its tail, line it up before the hole, push it in."""
 from __future__ import annotations
 
 from dataclasses import dataclass

@@ -19,11 +19,9 @@ class _Renderer:
     def __init__(self, model: Any, height: int, width: int):
         import mujoco
 
-        self._mujoco, self._gl = mujoco, _gl_context(height, width)
-        self._gl.make_current()
+        self._mujoco = mujoco
         model.vis.quality.offsamples = model.vis.quality.shadowsize = 0  # ten times cheaper frames
-        self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
-        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
+        self._gl, self._context = _contexts(model, height, width)
         self._scene, self._options = mujoco.MjvScene(model, 1000), mujoco.MjvOption()
         self._area, self._pixels = mujoco.MjrRect(0, 0, width, height), np.empty((height, width, 3), np.uint8)
 
@@ -37,17 +35,22 @@ class _Renderer:
         return self._pixels[::-1]  # OpenGL begins at the bottom
 
 
-def _gl_context(height: int, width: int) -> Any:
-    """A context of the backend that MUJOCO_GL names, else the system's usual one. Raises PdkitError where there is none."""
+def _contexts(model: Any, height: int, width: int) -> tuple[Any, Any]:
+    """OpenGL's context, current, of the backend that MUJOCO_GL names, else the system's usual one, and MuJoCo's with the model's meshes in
+    it. Raises PdkitError where there is none."""
     usual = {"linux": "egl", "darwin": "cgl"}.get(sys.platform, "glfw")
     backend = os.environ.get("MUJOCO_GL", "").lower() or usual
     try:
-        context = importlib.import_module(f"mujoco.{backend}").GLContext(width, height)
+        import mujoco
+
+        gl = importlib.import_module(f"mujoco.{backend}").GLContext(width, height)
+        gl.make_current()
+        meshes = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
     except Exception as error:
         raise PdkitError(f"MuJoCo cannot draw here with {backend} ({type(error).__name__}), and a visual policy needs pictures; "
                          "`pdkit doctor` names the package that is missing (Debian/Ubuntu: libegl1 libgl1-mesa-dri).") from error
-    atexit.register(context.free)  # before the backend itself is shut down
-    return context
+    atexit.register(gl.free)  # before the backend itself is shut down
+    return gl, meshes
 
 
 _RENDERERS: dict[tuple[str, int, int], _Renderer] = {}  # of this process: task, height, width

@@ -1,4 +1,5 @@
-"""The plain behaviour-cloning MLP: one observation to one action, mean squared error."""
+"""The plain behaviour-cloning MLP: one observation to one action, mean squared error (appendix D.1 names an MLP and gives no
+sizes: ours)."""
 from __future__ import annotations
 
 from typing import Any

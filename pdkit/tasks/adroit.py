@@ -56,8 +56,14 @@ def _make(env_id: str, render: bool):
         warnings.simplefilter("ignore")
         import gymnasium
 
-        with contextlib.redirect_stderr(io.StringIO()):  # a notice about dense rewards, which the kit does not use
-            import gymnasium_robotics
+        try:
+            with contextlib.redirect_stderr(io.StringIO()):  # a notice about dense rewards, which the kit does not use
+                import gymnasium_robotics
+        except Exception as error:  # whatever a graphics library that is missing makes of it; MuJoCo loads it with or without pictures
+            if "MUJOCO_GL" not in os.environ:
+                raise
+            raise PdkitError(f"MuJoCo does not start with MUJOCO_GL={os.environ['MUJOCO_GL']} ({type(error).__name__}); "
+                             "unset it, or set it to egl.") from error
         gymnasium.register_envs(gymnasium_robotics)
         height, width = RENDER_SIZE
         keywords = {"render_mode": "rgb_array", "width": width, "height": height} if render else {}
