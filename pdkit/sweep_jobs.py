@@ -85,13 +85,15 @@ def _training(spec: Spec, cell: dict[str, Any], seed: int) -> Job:
 
 
 def _as_recorded(spec: Spec, jobs: list[Job]) -> list[Job]:
-    """These trainings with the minutes that their recipe, or else their method, took for about as many steps where the spec records."""
+    """These trainings with the minutes that their recipe, or else their method, took for about as many steps where the spec records: over
+    whatever policy, on whatever machine and beside whatever else ran."""
     try:
         rows = load(spec.record)[0]
     except PdkitError:  # nothing is recorded
         return jobs
     if not {"method", "train_minutes", "env_steps"} <= set(rows):
         return jobs
+    rows = rows[(rows.env_steps > 0) & rows.train_minutes.notna()]
     rows = rows.assign(a_step=rows.train_minutes / rows.env_steps)
     timed = []
     for job in jobs:

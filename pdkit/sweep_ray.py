@@ -4,6 +4,7 @@ from __future__ import annotations
 import contextlib
 import os
 import signal
+import threading
 from collections.abc import Sequence
 from importlib.util import find_spec
 from typing import Any
@@ -21,13 +22,14 @@ def must_be_installed() -> None:
 
 def on_ray(function: JobFunction, job: Job) -> dict[str, Any]:
     """`work` in a worker of Ray, with the exit codes of what it starts."""
-    _keep_exit_codes()
+    _keep_exit_codes(signal.SIG_DFL)
     return work(function, job)
 
 
-def _keep_exit_codes() -> None:
+def _keep_exit_codes(handler: Any) -> None:
     """Undo what Ray does to a process when it is to end children: SIGCHLD ignored, so that each seems to exit with 0."""
-    signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+    if threading.current_thread() is threading.main_thread():  # no other may
+        signal.signal(signal.SIGCHLD, handler)
 
 
 class Ray:
@@ -44,12 +46,13 @@ class Ray:
 
         self._ray = ray
         path = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
+        before = signal.getsignal(signal.SIGCHLD) or signal.SIG_DFL
         own = {"address": address} if address else {"address": "local", "num_cpus": workers or 2, "include_dashboard": False}
         try:
             ray.init(**own, log_to_driver=False, logging_level="error", runtime_env={"env_vars": ONE_THREAD | {"PYTHONPATH": path}})
         except Exception as error:  # ConnectionError, ValueError, RuntimeError ...: depends on what is wrong with the address
             raise PdkitError(f"Ray does not start at {address or 'this machine'}: {reason(error)[:200].rstrip('.')}.") from None
-        _keep_exit_codes()
+        _keep_exit_codes(before)
         self.limit = workers or max(1, int(ray.cluster_resources().get("CPU", 1)))
         self._work = ray.remote(num_cpus=1, max_retries=0)(on_ray)
 

@@ -44,12 +44,12 @@ def _contexts(model: Any, height: int, width: int) -> tuple[Any, Any]:
         import mujoco
 
         gl = importlib.import_module(f"mujoco.{backend}").GLContext(width, height)
+        atexit.register(gl.free)  # before the backend itself is shut down
         gl.make_current()
         meshes = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
     except Exception as error:
         raise PdkitError(f"MuJoCo cannot draw here with {backend} ({type(error).__name__}), and a visual policy needs pictures; "
                          "`pdkit doctor` names the package that is missing (Debian/Ubuntu: libegl1 libgl1-mesa-dri).") from error
-    atexit.register(gl.free)  # before the backend itself is shut down
     return gl, meshes
 
 

@@ -60,10 +60,11 @@ def _make(env_id: str, render: bool):
             with contextlib.redirect_stderr(io.StringIO()):  # a notice about dense rewards, which the kit does not use
                 import gymnasium_robotics
         except Exception as error:  # whatever a graphics library that is missing makes of it; MuJoCo loads it with or without pictures
-            if "MUJOCO_GL" not in os.environ:
+            chosen = os.environ.get("MUJOCO_GL")
+            if not chosen or isinstance(error, ModuleNotFoundError) and error.name in ("gymnasium_robotics", "mujoco"):
                 raise
-            raise PdkitError(f"MuJoCo does not start with MUJOCO_GL={os.environ['MUJOCO_GL']} ({type(error).__name__}); "
-                             "unset it, or set it to egl.") from error
+            raise PdkitError(f"MuJoCo does not start with MUJOCO_GL={chosen} ({type(error).__name__}); `pdkit doctor` tells which "
+                             "backends work here, and without pictures it can be unset.") from error
         gymnasium.register_envs(gymnasium_robotics)
         height, width = RENDER_SIZE
         keywords = {"render_mode": "rgb_array", "width": width, "height": height} if render else {}
