@@ -18,7 +18,7 @@ from .demos.format import Demos
 from .errors import PdkitError, unknown
 from .evaluate import selection_scores
 from .gradient_steps import GradientSteps, make_optimizer
-from .policies import IMITATORS, POLICIES, Policy
+from .policies import POLICIES, Policy
 from .profiles import checked
 from .tasks import get_task
 from .tasks.spec import TaskSpec
@@ -67,8 +67,8 @@ def configured(kind: str, settings: dict[str, Any]) -> tuple[ImitateConfig, dict
 
     Raises PdkitError for an unknown kind or name, or a value that training cannot have; what the policy is made of `untrained` checks.
     """
-    if kind not in IMITATORS:
-        raise unknown("policy", kind, IMITATORS)
+    if kind not in POLICIES:
+        raise unknown("policy", kind, POLICIES)
     fields = {f.name for f in dataclasses.fields(ImitateConfig)}
     given = set(POLICIES[kind].defaults) - set(POLICIES[kind].made)
     for name in settings:

@@ -32,7 +32,7 @@ from .pixels.encoders import Encoder, save_encoder
 from .pixels.learn import check_pixels, imitate_pixels, look_up, visual_settings
 from .pixels.pictures import encoded, pictures_of
 from .pixels.task import ENCODER, encoder_of, pixel_spec, save_visual
-from .policies import IMITATORS, POLICIES, Policy, load_policy, save_policy
+from .policies import POLICIES, Policy, load_policy, save_policy
 from .policies.base import read_card
 from .profiles import PROFILES, differences, flat
 from .recorded import record
@@ -51,7 +51,7 @@ def main(argv: list[str]) -> int:
     kinds = parser.add_subparsers(dest="kind", required=True, parser_class=Parser)
     base = kinds.add_parser("base", help="imitate demonstrations")
     base.add_argument("task")
-    base.add_argument("--policy", default="bet", help=f"one of: {', '.join(IMITATORS)}")
+    base.add_argument("--policy", default="bet", help=f"one of: {', '.join(POLICIES)}")
     base.add_argument("--demos", help="demonstration file (default: the bundled one)")
     base.add_argument("--num-demos", type=int, help="use only the first so many")
     base.add_argument("--out", help="folder of the checkpoint (default runs/base/TASK-POLICY)")

@@ -52,7 +52,6 @@ def test_demonstrations_from_the_command_line(monkeypatch, tmp_path, capsys):
     ("demos", "StackCube", "--first-seed", "-5"), ("demos", "StackCube", "--first-seed", "99999999999"), ("demos", "Door", "--noise", "-1"),
     ("demos", "Door", "--tail", "-200"), ("demos", "--show", "none.safetensors"),
     ("demos", "StackCube", "--source", "human"), ("train", "base", "Door", "--policy", "gan"), ("train", "base", "Pens"),
-    ("train", "base", "Door", "--policy", "zero"),
     ("train", "base", "Door", "--num-demos", "99"), ("train", "base", "Door", "--set", "iterrations=3"),
     ("train", "decorated", "Door", "--set", "alpha=7.0"), ("train", "decorated", "Door", "--profile", "x"),
     ("train", "decorated", "Door", "--set", "seed=3"), ("train", "decorated", "Door", "--seeds", "-1"),

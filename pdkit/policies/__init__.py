@@ -12,7 +12,6 @@ from .vinn import VINN
 from .zero import Zero
 
 POLICIES: dict[str, type[Policy]] = {cls.kind: cls for cls in (BeT, BeTForSAC, DiffusionPolicy, MLP, BCRNN, CNN, VINN, Zero)}
-IMITATORS = tuple(kind for kind in POLICIES if kind != Zero.kind)  # what demonstrations can be given to
 
-__all__ = ["BCRNN", "CNN", "IMITATORS", "POLICIES", "BeT", "BeTForSAC", "DiffusionPolicy", "MLP", "VINN", "Normalizer", "Policy", "Zero",
-           "load_policy", "save_policy"]
+__all__ = ["BCRNN", "CNN", "POLICIES", "BeT", "BeTForSAC", "DiffusionPolicy", "MLP", "VINN", "Normalizer", "Policy", "Zero", "load_policy",
+           "save_policy"]
