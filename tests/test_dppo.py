@@ -268,12 +268,13 @@ def test_killed_and_resumed_gives_the_same_curve(tmp_path):
     assert torch.equal(whole.replay.rows, resumed.replay.rows)
 
 
-def test_it_improves_a_biased_policy_and_leaves_the_start_alone(biased, tmp_path):  # noqa: F811
-    """By DPPO's own clip, discount and least stds."""
+@pytest.mark.parametrize("rank", [0, 4])
+def test_it_improves_a_biased_policy_and_leaves_the_start_alone(biased, tmp_path, rank):  # noqa: F811
+    """By DPPO's own clip, discount and least stds; all weights, or adapters."""
     before, ends = {k: v.clone() for k, v in biased.state_dict().items()}, []
     for seed in range(2):
         trainer = start(biased, seed=seed, num_envs=16, total_steps=14_000, gamma=0.8, ppo_epochs=8, ppo_minibatches=4, ppo_lr=1e-3,
-                        dppo_value_lr=3e-3, hidden=64)
+                        dppo_value_lr=3e-3, hidden=64, lora=rank)
         ends.append(success(learned := trainer.train()))
     assert success(biased) < 0.45 and min(ends) > success(biased) + 0.15, ends
     assert all(torch.equal(v, before[k]) for k, v in biased.state_dict().items())
