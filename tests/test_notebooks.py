@@ -143,8 +143,9 @@ def test_warm_start(tmp_path):
 
 def test_q_architectures(tmp_path):
     result = run("08", tmp_path)
-    assert result["moved"] == "reproduced" and set(result["seconds"]) == {"mlp", "shared", "separate"}
-    alone, both = result["drift"]["Critics alone"], result["drift"]["Critics and actor"]
+    assert result["moved"] == "reproduced" and set(result["critics"]) == {"mlp", "shared", "separate"}
+    alone, both = ({kind: numbers[name] for kind, numbers in result["critics"].items()} for name in ("moved alone", "moved"))
+    assert all(numbers["error"] > 0 and numbers["seconds"] > 0 for numbers in result["critics"].values())
     assert alone["mlp"] == alone["separate"] == 0 < alone["shared"] and min(both.values()) > 0
     zero = {pull["critic"] for pull in result["pulls"] if pull["value"] == 0}
     assert zero == {"MLP", "separate transformer"} and all(pull["policy"] > 0 for pull in result["pulls"])
@@ -161,18 +162,22 @@ def test_calql(tmp_path):
     result = run("09", tmp_path)
     assert [row["setup"] for row in result["setups"]] == list("ABCDE")
     assert result["own"]["setup"] == "B" and result["own"]["steps"] >= 600 and result["updates"] == 4
-    assert set(result["values"]) == {"TD alone", "CQL", "Cal-QL"} and len(result["seconds"]) == 4
+    assert set(result["values"]) == {"TD alone", "CQL", "Cal-QL"}
+    times = {actor: set(taken) for actor, taken in result["seconds"].items()}
+    assert times == {name: {"SAC", "Cal-QL"} for name in ("small MLP", "transformer")}
     data = {row["source"]: row for row in result["data"]}
     assert data["demonstrations"]["worst"] == 0 and data["rollouts"]["episodes"] == 4
     assert (tmp_path / "calibration.png").exists() and result["exercise_solved"] is False
 
 
-@pytest.mark.parametrize("name, parameters", [("07", {}), ("08", dict(updates=2, own_steps=300)), ("09", dict(own_setup="C"))])
+@pytest.mark.parametrize("name, parameters", [("07", {}), ("08", dict(updates=2, own_steps=0)), ("09", dict(own_steps=0))])
 def test_what_becomes_of_fine_tuning_on_the_cube(tmp_path, name, parameters):
     result = run(name, tmp_path, task="StackCube", **parameters)
     assert result["task"] == "StackCube"
     if name == "07":  # the target entropy is the paper's, not that of the lesson recipe, which lets no temperature rise
         assert result["runs"]["warm"]["temperature"] > 1
+    if name != "07":
+        assert result["own"] is None
     if name == "09":
         data = {row["source"]: row for row in result["data"]}
         assert data["demonstrations"]["episodes"] == 300 and data["rollouts"]["episodes"] == 4
