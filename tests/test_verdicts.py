@@ -544,7 +544,8 @@ def test_novel_objects_and_the_mlp_below_them(results, ends, verdict):
     mlp = verdicts.find("Policy Decorator significantly improves an MLP base policy.")
     assert (mlp.tasks, mlp.verdict) == ("TurnFaucet", "reproduced" if min(ends) >= 0.8 else "not" if max(ends) < 0.5 else "partly")
     write(results, "base_policies", runs("mlp", [0.6] * 3))
-    assert verdicts.find("Policy Decorator significantly improves an MLP base policy.").tasks == "Door"
+    found = verdicts.find("Policy Decorator significantly improves an MLP base policy.")
+    assert found.tasks == "Door" and "; not judged: TurnFaucet mlp (best evaluation)" in found.measured
     write(results, "base_policies", runs("mlp", [0.0] * 3, base=0.0))  # nothing to tell apart there: the main job does not stand in
     assert verdicts.find("Policy Decorator significantly improves an MLP base policy.") is None
 
@@ -707,20 +708,24 @@ def test_what_a_lesson_cannot_reach_stays_untested():
     assert verdicts.find(claim) is None and CLAIMS.verdict[CLAIMS.claim == claim].item() == "untested"
 
 
-@pytest.mark.parametrize(("late", "verdict"), [((0.9, 0.9), None), ((0.7, 0.9), None), ((0.7, 0.7), "partly")])
-def test_a_longer_run_of_cal_ql_is_unstable_where_its_last_third_is_worse(results, late, verdict):
+@pytest.mark.parametrize(("late", "scatter", "verdict"), [
+    ((0.9, 0.9), 0.02, None), ((0.75, 0.9), 0.02, None), ((0.7, 0.7), 0.02, "partly"), ((0.5, 0.5), 0.2, "partly")])
+def test_a_longer_run_of_cal_ql_is_unstable_where_its_last_third_is_worse(results, late, scatter, verdict):
     """Not by a single evaluation, nor by what happened in the first third, and never more than partly: the paper's run is ten times as
     long."""
     steps = [50_000, 100_000, 150_010, 200_000, 250_000, 300_010]
     ways = {"calql_a,n_step=1": late, "policy_decorator": (1.0, 1.0)}
     curves = [pd.DataFrame({"task": "Door", "recipe": recipe, "seed": seed, "step": steps,
-                            "success_once": [1.0, 0.2, 0.9, 0.9, *np.add(end, 0.02 * (seed - 1))]})
+                            "success_once": [1.0, 0.2, 0.9, 0.9, *np.add(end, scatter * (seed - 1))]})
               for recipe, end in ways.items() for seed in range(3)]
     write(results, "calql_long", runs("calql_a,n_step=1", [0.5] * 3), runs("policy_decorator", [1.0] * 3), curves=pd.concat(curves))
     [claim] = starting("Cal-QL is unstable when run longer")
     found, told = verdicts.find(claim), verdicts.updated(CLAIMS[CLAIMS.claim == claim]).measured.item()
     assert (found and found.verdict) == verdict
     assert f"300,010 steps: 90.0 % and {50 * sum(late):.1f} %; not judged: the decorator's 90.0 % and 100.0 %" in told
+    write(results, "calql_long", runs("calql_a,n_step=1", [0.5] * 3), curves=pd.concat(curves[:3]))  # without the decorator
+    assert (found := verdicts.find(claim)) is None or (found.verdict == verdict and "decorator" not in found.measured)
+    assert (found is None) == (verdict is None)
 
 
 def test_an_untested_claim_says_why():
