@@ -110,14 +110,11 @@ def _() -> Finding:
     Rule and sweep were written before any run; beside it, and not judged, the decorator's."""
     _, curves = recorded("calql_long")
 
-    def third(recipe: str, which: int) -> pd.Series:
+    def thirds(recipe: str) -> list[pd.Series]:
         rows = evaluations(curves, recipe)
         of_run = np.ceil(3 * rows.step / rows.groupby(["task", "seed"]).step.transform("max"))
-        means = rows[of_run == which].groupby(["task", "recipe", "seed"], as_index=False).success_once.mean()
-        return by_seed(means, recipe, "success_once")
-
-    def thirds(recipe: str) -> list[pd.Series]:
-        return [third(recipe, which) for which in (2, 3)]
+        means = rows.groupby(["task", "recipe", "seed", of_run.rename("third")]).success_once.mean().reset_index()
+        return [by_seed(means[means.third == which], recipe, "success_once") for which in (2, 3)]
 
     interval, values = difference(*(own := thirds("calql_a,n_step=1")))
     middle, last = (percent(average(part)) for part in own)
