@@ -143,7 +143,7 @@ def _base(args) -> int:
     print(f"wrote {out}", flush=True)
     if args.episodes:  # after the policy is safe
         spec = pixel_spec(get_task(args.task), encoder) if encoder else get_task(args.task)
-        test = {"episodes": args.episodes} | _outcome("base", _episodes(load_policy(out), spec, args.episodes))
+        test = {"episodes": args.episodes} | _outcome("base", _episodes(load_policy(out), spec, args.episodes, config.seed))
         write_json(out / "policy.json", read_card(out) | {"info": info | {"test": test}})
         print("  " + ", ".join(f"{k} {v}" for k, v in test.items()), flush=True)
     return 0
@@ -230,7 +230,7 @@ def decorate(config, base: Policy, demos: Demos | None, out: Path, episodes: int
         inside = out / "decorated" / "base"  # of a decorated policy; fine-tuning leaves a plain one
         save_encoder(encoder, (inside if inside.is_dir() else inside.parent) / ENCODER)
     tables = {"base": _base_episodes(base, trainer.spec, episodes, config, started_from),
-              "decorated": _episodes(policy, trainer.spec, episodes)}
+              "decorated": _episodes(policy, trainer.spec, episodes, config.seed)}
     for name, table in tables.items():
         with atomic_file(out / f"{name}_episodes.csv") as temporary:
             table.to_csv(temporary, index=False)
@@ -244,20 +244,24 @@ def decorate(config, base: Policy, demos: Demos | None, out: Path, episodes: int
     return row
 
 
-def _episodes(actor: Policy | Decorated, spec: TaskSpec, episodes: int) -> pd.DataFrame:
-    actor.reset(0)
+def _episodes(actor: Policy | Decorated, spec: TaskSpec, episodes: int, draw: int) -> pd.DataFrame:
+    """The test episodes. A policy that samples acts on random numbers of its own in each run (`draw`): with the same ones in all, a base
+    policy's luck with them would look like what every run lost or gained."""
+    actor.reset(draw)
     return evaluate(spec, actor.act, reported_seeds(episodes), window=actor.window, chunk=actor.chunk,
                     num_envs=50)
 
 
 def _base_episodes(base: Policy, spec: TaskSpec, episodes: int, config: OnlineConfig, started_from: dict[str, Any]
                    ) -> pd.DataFrame:
-    """The base policy's test episodes: the same for every method and seed that starts from it, so they are run once and kept."""
+    """The base policy's test episodes: the same for every method that starts from it, and for every seed unless it samples, so they are run
+    once and kept."""
+    draw = [config.seed] if base.samples else []
     weights = [started_from[name] for name in ("base", "encoder", "objects") if name in started_from]
-    what = json.dumps([spec.name, config.start_fraction, episodes, *weights, base.kind, base.config, describe_machine()["versions"]])
+    what = json.dumps([spec.name, config.start_fraction, episodes, *weights, base.kind, base.config, describe_machine()["versions"], *draw])
     kept = runs_root() / "base_episodes" / f"{spec.name}-{hashlib.sha256(what.encode()).hexdigest()[:16]}.csv"
     if not kept.exists():
-        table = _episodes(base, spec, episodes)
+        table = _episodes(base, spec, episodes, config.seed)
         with atomic_file(kept) as temporary:
             table.to_csv(temporary, index=False)
     return pd.read_csv(kept)

@@ -8,6 +8,7 @@ import minari
 import numpy as np
 import pandas as pd
 import pytest
+import torch
 from worlds import reach_demos
 
 import pdkit.demos.sources as sources
@@ -18,9 +19,11 @@ from pdkit.demos import load_demos, save_demos
 from pdkit.errors import PdkitError
 from pdkit.files import DATA
 from pdkit.policies import load_policy
+from pdkit.policies.diffusion import DiffusionPolicy
 from pdkit.probes import PROBES, ProbeBase
+from pdkit.profiles import online_config
 from pdkit.seeds import reported_seeds
-from pdkit.tasks import TASKS
+from pdkit.tasks import TASKS, get_task
 from pdkit.tensorboard import Board
 from pdkit.train import parse_settings
 
@@ -169,6 +172,23 @@ def test_training_from_the_command_line_records_a_row_a_seed(monkeypatch, tmp_pa
     assert policy.base.state_dict().keys() == base.state_dict().keys()
     with pytest.raises(PdkitError, match="differing: demos, num_demos"):  # the same folder with other demonstrations is another run
         train.main([*words[1:], "--num-demos", "2"])
+
+
+def test_a_base_policy_that_samples_is_tested_on_random_numbers_of_each_run(monkeypatch, tmp_path):
+    """One draw for all runs would take a lucky start for what each of them lost."""
+    monkeypatch.setenv("PDKIT_RUNS", str(tmp_path))
+    drawn = []
+    monkeypatch.setattr(train, "evaluate", lambda *_, **__: drawn.append(torch.initial_seed()) or pd.DataFrame({"success_once": [0]}))
+    for kind, wanted in (("diffusion", [0, 1, 2]), ("base", [0])):
+        drawn.clear()
+        policy = load_policy(DATA / "checkpoints" / "StackCube" / kind)
+        assert policy.samples == (kind == "diffusion")
+        for seed in (0, 1, 2, 1):
+            config = online_config("StackCube", "lesson", seed)
+            train._base_episodes(policy, get_task("StackCube"), 2, config, {"base": kind})
+        assert drawn == wanted
+    shape = dict(obs_dim=3, act_dim=2, dims=[8])
+    assert not DiffusionPolicy(shape | dict(temperature=0.0)).samples and DiffusionPolicy(shape | dict(sampler="ddpm")).samples
 
 
 def test_the_command_of_a_row_can_be_pasted_into_a_shell():

@@ -54,6 +54,7 @@ class Policy(nn.Module):
     chunk = 1  # primitive actions it returns
     horizon = 0  # actions it learns from the first observation of a window on; 0: one for each observation
     recipe: dict[str, Any] = {}  # how it is trained where that differs from the defaults of ImitateConfig
+    samples = False  # whether acting draws random numbers: then success on the same episodes differs from one `reset(seed)` to another
     learns = True  # by gradient steps on `loss`; otherwise `remember` is all there is
     defaults: dict[str, Any] = {}  # of its settings; each must be of its default's type
     least: dict[str, float] = {}  # the least values of settings, where not the usual ones (settings.py)

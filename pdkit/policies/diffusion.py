@@ -128,6 +128,10 @@ class DiffusionPolicy(Policy):
         self.late = copy.deepcopy(self.unet) if c["late_steps"] else None
 
     @property
+    def samples(self) -> bool:
+        return self.config["sampler"] != "ddim" or self.config["temperature"] > 0
+
+    @property
     def condition_dim(self) -> int:
         """How many numbers FiLM sees of the observations."""
         return (self.config["obs_dim"] * self.window, *self.config["obs_encoder"])[-1]
