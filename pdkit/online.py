@@ -100,6 +100,8 @@ class Trainer:
         while episodes last half a chunk or longer."""
         return min(self.config.total_steps, 2 * -(-self.config.total_steps // self.base.chunk))
 
+    reads: tuple[str, ...] = ()  # what its names begin with that it takes from MethodConfig
+    unread: frozenset[str] = frozenset()  # settings of the loop and of SAC that mean nothing to it
     sees_features = True  # whether the agent's networks see what `sight` shows
     chunks = True  # whether base policies may decide on several actions at once
 
@@ -202,6 +204,9 @@ class Trainer:
             started = time.monotonic()
             self._collect(evaluations, progress, wait=True)
             self.train_seconds += time.monotonic() - started
+        if c.utd and self.agent.updates == self.offline_updates:
+            raise PdkitError(f"Nothing was learned in {self.step:,} steps: the memory holds {self.replay.size} decisions and a batch takes "
+                             f"{c.batch}; take more steps or smaller batches.")
         return self.result()
 
     def _evaluations(self) -> Evaluations:
@@ -271,13 +276,15 @@ class Trainer:
             evaluations.submit(self.step, self._actor.state_dict())
 
     def _collect(self, evaluations: Evaluations, progress, wait: bool = False) -> None:
-        """Enter what has been evaluated into its row, and keep the best actor since the gate was open."""
+        """Enter what has been evaluated into its row, and keep the best actor since the gate was open and the actor learned."""
         for step, weights, scores in evaluations.collect(wait):
-            next(row for row in reversed(self.rows) if row["step"] == step).update(scores)
+            row = next(row for row in reversed(self.rows) if row["step"] == step)
+            row.update(scores)
             score = scores["success_once"]
             if self.config.on_success == "continue":  # then staying solved is learned too
                 score = (score + scores["success_at_end"]) / 2
-            if self.config.select == "best" and step >= max(self.config.decorator.H, 1) and score >= self.best_score:
+            learned = row["updates"] > self.config.sac.critic_warmup  # or it is what the run started from
+            if self.config.select == "best" and learned and step >= max(self.config.decorator.H, 1) and score >= self.best_score:
                 self.best_score, self.best_actor = score, weights
             if progress:
                 progress(self)

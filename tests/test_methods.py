@@ -1,4 +1,6 @@
 """Methods: what each changes in the loop, and that it learns."""
+import re
+
 import numpy as np
 import pytest
 import torch
@@ -15,6 +17,7 @@ from pdkit.online import Trainer
 from pdkit.online_config import OnlineConfig
 from pdkit.policies import BeT, BeTForSAC, load_policy, save_policy
 from pdkit.probes import PROBES, biased_base
+from pdkit.profiles import flat
 from pdkit.tasks import TASKS
 from pdkit.unlearning import set_spread
 
@@ -121,6 +124,23 @@ def test_every_method_has_a_configuration_in_every_profile(method):
 @pytest.mark.parametrize("method", ["rot", "fish"])
 def test_under_a_reward_by_likeness_no_task_ends_an_episode_at_success(method, task):
     assert method_config(method, task).on_success == "continue"
+
+
+@pytest.mark.parametrize(("method", "changes"), [
+    ("ppo_decorator", dict(actor_lr=1e-3)), ("ppo_finetune", dict(batch=64, average=0.0)), ("sac_finetune", dict(log_std_range=(-3.0, 2.0))),
+    ("dipo", dict(actor_value="mean")), ("dppo", dict(tau=0.1)), ("fish", dict(ot_trunk=8)), ("calql_a", dict(calql_pretrained=False)),
+    ("policy_decorator", dict(ppo_lr=1e-3)), ("rot", dict(critic_backbone="shared")), ("jsrl", dict(calql_actions=2))])
+def test_a_setting_that_a_method_does_not_read_is_refused(method, changes):
+    """Else a sweep over it would be the same run many times."""
+    with pytest.raises(PdkitError, match=f"{re.escape(METHODS[method].title)} does not read {', '.join(changes)}; leave that out"):
+        method_config(method, "Door", **changes)
+
+
+@pytest.mark.parametrize(("method", "changes"), [
+    ("ppo_finetune", dict(ppo_lr=1e-3, lora=4)), ("dppo", dict(ppo_epochs=2, dppo_clip=0.1, lora=4)), ("rot", dict(ot_trunk=8, lora=4)),
+    ("dipo", dict(dipo_lr=0.1, critic_lr=1e-3)), ("calql", dict(calql_actions=2, lora=4)), ("jsrl", dict(jsrl_step=5, actor_lr=1e-3))])
+def test_a_setting_that_a_method_reads_is_taken(method, changes):
+    assert flat(method_config(method, "Door", **changes)).items() >= changes.items()
 
 
 def test_rlpd_has_the_numbers_of_the_original():

@@ -74,7 +74,7 @@ def test_residuals_before_learning(warmup, expected):
 
 
 def test_the_gate_is_applied_while_training_and_not_in_evaluation():
-    trainer = Trainer(config(n_step=1, total_steps=3000, warmup="uniform", warmup_steps=2999, eval_every=0,
+    trainer = Trainer(config(n_step=1, total_steps=3000, warmup="uniform", warmup_steps=2990, eval_every=0,
                              decorator=DecoratorConfig(alpha=0.6, H=3000)), biased_base(), spec=SPEC)
     trainer.train()
     zero = (columns(trainer)["residual"] == 0).all(axis=1)
@@ -293,6 +293,26 @@ def test_the_result_is_the_best_evaluated_policy_or_the_last(tmp_path):
         best = max(open_gate, key=lambda step: (open_gate[step], step))
         assert torch.equal(policy.actor.head.bias, actors[best if select == "best" else max(actors)])
     assert not torch.equal(actors[min(actors)], actors[max(actors)])
+
+
+@pytest.mark.parametrize("critic_warmup", [0, 60])
+def test_what_has_not_learned_yet_is_never_the_result(monkeypatch, critic_warmup):
+    """Without a gate evaluations count from the first on, and those in the warm-up are of what the run started from."""
+    scores = iter([1.0, 1.0, 0.5, 0.2])
+    monkeypatch.setattr("pdkit.online_eval.selection_scores", lambda *_: dict(success_once=(s := next(scores)), success_at_end=s))
+    c = config(select="best", eval_every=100, warmup_steps=250, decorator=DecoratorConfig(alpha=0.6, H=0),
+               sac=dataclasses.replace(SMALL, critic_warmup=critic_warmup))
+    trainer, actors = Trainer(c, biased_base(), spec=SPEC), {}
+    policy = trainer.train(progress=lambda t: actors.setdefault(t.step, t.agent.average.head.bias.clone()))
+    updates = [row["updates"] for row in trainer.rows]
+    assert updates[:2] == [0, 0] and 0 < updates[2] < 60 < updates[3]
+    assert trainer.best_score == (0.2 if critic_warmup else 0.5)
+    assert torch.equal(policy.actor.head.bias, actors[400 if critic_warmup else 300])
+
+
+def test_a_run_that_learned_nothing_is_told():
+    with pytest.raises(PdkitError, match="Nothing was learned in 400 steps: the memory holds 400 decisions and a batch takes 400; take"):
+        Trainer(config(batch=400), biased_base(), spec=SPEC).train()
 
 
 def test_another_configuration_does_not_resume_a_run(tmp_path):

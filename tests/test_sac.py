@@ -247,6 +247,17 @@ def test_ensemble_members_are_independent():
     assert not torch.allclose(values[0], values[1])
 
 
+def test_values_a_residual_apart_differ_in_bfloat16_too():
+    """A value of -25 has neighbours 0.125 away there."""
+    torch.manual_seed(0)
+    critics = Critics(6, 64, 2, 2, layer_norm=True)
+    for member in critics.members:
+        torch.nn.init.constant_(member[-1].bias, -25.0)
+    with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):
+        values = critics(torch.randn(256, 6))
+    assert values.dtype == torch.float32 and all(len(row.unique()) > 128 for row in values)
+
+
 @pytest.mark.parametrize("bf16", [False, pytest.param(True, marks=pytest.mark.skipif(not cpu_has_bf16(), reason="no bfloat16 here"))])
 def test_bfloat16_learns_like_float32(bf16):
     """Equal learning, not equal numbers: a quadratic bandit solved by both to the same place."""

@@ -53,6 +53,7 @@ class OfflineFirst:
 
     needs_demos = True
     sees_features = False
+    reads = ("calql_",)
 
     def __init__(self, config, base, demos=None, spec=None):
         own = config.method_config
@@ -99,12 +100,16 @@ class OfflineFirst:
 class SmallCalQL(OfflineFirst, Scratch):
     """Setups A to C: the small actor that SAC from scratch has."""
 
+    unread = frozenset({"calql_pretrained"})
+
     def _make_agent(self) -> CalQL:
         return self._learner(normalize=self.base.normalizer if self.config.normalize_obs else None)
 
 
 class TransformerCalQL(OfflineFirst, FineTune):
     """Setups D and E: a transformer as actor, critics on the last observation, as in fine-tuning."""
+
+    reads = (*OfflineFirst.reads, "lora")
 
     def _make_agent(self) -> CalQL:
         start, own = self._start_policy, self.config.method_config

@@ -23,6 +23,10 @@ from .diffusion import FineTuneDiffusion
 class DIPO(FineTuneDiffusion):
     """Every decision goes to two replays: what was executed to the critics', the whole sequence to the actor's."""
 
+    reads = ("dipo_", "lora")
+    unread = FineTuneDiffusion.unread | {"target_subset", "actor_value", "entropy_backup", "residual_penalty", "autotune",
+                                         "init_temperature", "target_entropy_scale"}
+
     def __init__(self, config, base, demos=None, spec=None):
         super().__init__(config, base, demos, spec)
         if not base.config["temperature"]:

@@ -25,6 +25,9 @@ from .ppo import OnPolicy
 class DPPO(OnPolicy, FineTuneDiffusion):
     """A rollout holds the chains of its decisions."""
 
+    reads = ("ppo_", "dppo_", "lora")
+    unread = OnPolicy.unread | FineTuneDiffusion.unread
+
     def _make_agent(self) -> Learner:
         c, m = self.config, self.config.method_config
         actor = self._start_policy.with_late(m.dppo_steps).requires_grad_(False)

@@ -40,6 +40,8 @@ class FineTune(Trainer):
 
     starts_from: type[Policy] = BeTForSAC  # the only kind of base policy that it can tune
     sees_features = False
+    reads = ("lora", "critic_backbone")
+    unread = frozenset({"log_std_range", "actor_layer_norm"})  # the actor is the base policy, with its own
 
     def __init__(self, config, base, demos=None, spec=None):
         kind = self.starts_from.kind

@@ -75,6 +75,7 @@ class JSRL(Trainer):
     """
 
     chunks = False
+    reads = ("jsrl_",)
 
     def __init__(self, config, base, demos=None, spec=None):
         if config.decorator.alpha != 1 or config.decorator.alpha_scale or config.decorator.H or config.demo_fraction:

@@ -30,6 +30,7 @@ from ..online_config import decision_reward, lr_factor, stops
 from ..rl.gpt_critic import GPTCritics, make_backbone
 from ..rl.ppo import PPO, ROLLOUT_COLUMNS
 from ..rl.replay import Replay
+from ..rl.sac import SACConfig
 from .finetune import FineTune
 
 
@@ -37,6 +38,9 @@ class OnPolicy(Trainer):
     """Collects `ppo_rollout` decisions of every environment, learns from them, and forgets them."""
 
     sees_features = False
+    reads = ("ppo_",)
+    unread = frozenset({*SACConfig.__dataclass_fields__, "utd", "batch", "n_step"}
+                       - {"hidden", "layers", "actor_layer_norm", "critic_layer_norm", "log_std_range"})
 
     def __init__(self, config, base, demos=None, spec=None):
         m, rows = config.method_config, config.method_config.ppo_rollout * config.num_envs
@@ -88,6 +92,9 @@ class OnPolicy(Trainer):
 class PPOFineTune(OnPolicy, FineTune):
     """PPO on a `bet-sac` policy with adapters; the value function is an MLP on the last observation, or a head on a transformer
     (`critic_backbone`, appendix F.5.1)."""
+
+    reads = OnPolicy.reads + FineTune.reads
+    unread = OnPolicy.unread | FineTune.unread
 
     def _make_agent(self) -> PPO:
         c, m, start = self.config, self.config.method_config, self._start_policy

@@ -15,6 +15,7 @@ from ..profiles import online_config, policy_values
 from ..tasks import get_task
 from ..tasks.spec import TaskSpec
 from . import METHODS, Method
+from .config import MethodConfig
 
 
 def get_method(name: str) -> Method:
@@ -27,14 +28,25 @@ def get_method(name: str) -> Method:
 def method_config(method: str, task: str, profile: str = "lesson", seed: int = 0, /, policy: Policy | None = None,
                   **changes: Any) -> OnlineConfig:
     """The configuration of a method on a task: the task's profile, what it sets otherwise over this base policy where the method acts
-    in its chunks, then the method's changes, then `changes` (flat names)."""
+    in its chunks, then the method's changes, then `changes` (flat names).
+
+    Raises PdkitError for a change that means nothing to the method: two runs that differ in it alone would be the same run.
+    """
     m = get_method(method)
+    if unread := _unread(method, changes):
+        raise PdkitError(f"{m.title} does not read {', '.join(unread)}; leave that out.")
     own = m.changes | {"lesson": m.lesson, "smoke": m.lesson, "paper": m.paper}.get(profile, {})
     sees_state = policy is None or policy.config["obs_dim"] == get_task(task).obs_dim  # and not what an encoder makes of pictures
     chunks = policy is not None and trainer_of(method).chunks
     over = policy_values(task, profile, policy.kind, policy.chunk, not sees_state) if chunks else {}
     over |= {} if trainer_of(method).sees_features and sees_state else {"features": False}
     return online_config(task, profile, seed, **({"method": method} | over | own | changes))
+
+
+def _unread(method: str, changes: dict[str, Any]) -> list[str]:
+    """Those of `changes` that the method's trainer does not look at."""
+    trainer, own = trainer_of(method), MethodConfig.__dataclass_fields__
+    return [name for name in changes if name in trainer.unread or (name in own and not name.startswith(trainer.reads))]
 
 
 def base_folder(method: str, task: str) -> Path:

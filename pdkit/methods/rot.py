@@ -51,6 +51,8 @@ class ROTAgent(QFilteredSAC):
 class ROT(OTRewarded, FineTune):
     """Fine-tuning with both changes."""
 
+    reads = (*OTRewarded.reads, "lora")
+
     def _make_agent(self) -> ROTAgent:
         c, m, dim = self.config, self.config.method_config, self.spec.obs_dim
         critics = TrunkCritics(dim, self.spec.act_dim, m.ot_trunk, c.sac.hidden, c.sac.layers, c.sac.num_critics, c.sac.critic_layer_norm)

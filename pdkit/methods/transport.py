@@ -25,6 +25,7 @@ class OTRewarded(Trainer):
 
     needs_demos = True
     sees_features = False
+    reads = ("ot_", "bc_weight")
     _phi: nn.Module | None = None  # the network in these features, if it is renewed
 
     def __init__(self, config, base, demos=None, spec=None):
