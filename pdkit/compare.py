@@ -247,7 +247,7 @@ def own_run(method: str, task: str, profile: str, seed: int, folder: Path, episo
     card, policy = read_card(start), load_policy(start)
     config = method_config(method, task, profile, seed, policy=policy, **changes)
     needed = config.demo_fraction or trainer_of(method).needs_demos
-    demos = sources.bundled(task).first(card["info"]["demos"]) if needed else None
+    demos = sources.learned_from(sources.bundled(task), card) if needed else None
     encoder = encoder_of(start)
     started_from = origin(card, demos, encoder, object_set(get_task(task)))
     settings = flat(config) | started_from

@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import fcntl
 import hashlib
 import json
 import os
@@ -16,6 +17,7 @@ from .errors import PdkitError
 ROOT = Path(__file__).resolve().parent.parent
 DATA = ROOT / "data"
 
+TEMPORARY = ".tmp-"  # in the name of what is just being written
 
 def runs_root() -> Path:
     """Where results go: runs/ in the project, or the folder that PDKIT_RUNS names."""
@@ -37,7 +39,7 @@ def atomic_file(path: str | Path) -> Iterator[Path]:
     Raises PdkitError when the folder cannot be written or the disk is full.
     """
     path = Path(path)
-    temporary = path.with_name(f"{path.name}.tmp-{os.getpid()}{path.suffix}")
+    temporary = path.with_name(f"{path.name}{TEMPORARY}{os.getpid()}{path.suffix}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         yield temporary
@@ -58,8 +60,8 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
     path = Path(os.path.realpath(path))
     if path == path.parent:
         raise PdkitError(f"{path} cannot be replaced; name a folder below it.")
-    temporary = path.with_name(f"{path.name}.tmp-{os.getpid()}")
-    old = path.with_name(f"{path.name}.tmp-old-{os.getpid()}")
+    temporary = path.with_name(f"{path.name}{TEMPORARY}{os.getpid()}")
+    old = path.with_name(f"{path.name}{TEMPORARY}old-{os.getpid()}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         shutil.rmtree(temporary, ignore_errors=True)
@@ -94,8 +96,8 @@ def check_replaceable(path: str | Path, *names: str) -> None:
 def recover(path: str | Path) -> None:
     """Put back the folder at `path` that a killed process had moved away for a new one, and remove what such processes left beside it."""
     path = Path(os.path.realpath(path))
-    left = [part for part in path.parent.glob(f"{path.name}.tmp-*") if part.is_dir() and not _alive(part.name.rpartition("-")[2])]
-    old = [part for part in left if part.name.startswith(f"{path.name}.tmp-old-")]
+    left = [part for part in path.parent.glob(f"{path.name}{TEMPORARY}*") if part.is_dir() and not _alive(part.name.rpartition("-")[2])]
+    old = [part for part in left if part.name.startswith(f"{path.name}{TEMPORARY}old-")]
     if old and not path.exists():
         os.replace(max(old, key=lambda part: part.stat().st_mtime), path)
     for part in left:
@@ -113,6 +115,24 @@ def _alive(pid: str) -> bool:
     except PermissionError:
         return True
     return True
+
+
+@contextlib.contextmanager
+def locked(path: str | Path, busy: str) -> Iterator[None]:
+    """Within this block no other process is in one with the same lock file. Raises PdkitError with the sentence `busy` where one is, and
+    where the file cannot be written or locked."""
+    try:
+        handle = open(path, "a")
+    except OSError as error:
+        raise _told(error, Path(path)) from error
+    with handle:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise PdkitError(busy) from None
+        except OSError as error:
+            raise PdkitError(f"{path} cannot be locked: {error.strerror}; choose a folder on another disk.") from None
+        yield
 
 
 def write_json(path: str | Path, value: Any) -> None:

@@ -166,7 +166,8 @@ class Trainer:
                          workers=c.env_workers, simulator=c.simulator,
                          terminate_on_success=c.on_success == "terminate", success_tail=c.success_tail,
                          max_episode_steps=shortened(c.train_limit, c.start_fraction) or None)
-        with envs, contextlib.closing(self._evaluations()) as evaluations:
+        alone = run.alone() if run is not None else contextlib.nullcontext()
+        with alone, envs, contextlib.closing(self._evaluations()) as evaluations:
             windows, base = self._start(envs, run)
             for step, weights in sorted(self._unscored.items()):
                 evaluations.submit(step, weights)

@@ -26,7 +26,7 @@ import pandas as pd
 from . import page, plots_range, task_range, verdicts
 from .cli import Parser
 from .errors import PdkitError
-from .files import DATA, atomic_file, runs_root
+from .files import DATA, TEMPORARY, atomic_file, runs_root
 from .plots import Picture, save_small
 from .recorded import KEYS, of_these_objects, picture_of
 
@@ -82,8 +82,9 @@ def claim_problems(claims: pd.DataFrame) -> list[str]:
 
 
 def recorded_tables(folder: Path) -> dict[str, pd.DataFrame]:
-    """The recorded tables of a row a run, by name (without the claims and the curves)."""
-    return {path.stem: _read(path) for path in sorted(folder.glob("*.csv")) if path.stem != "claims" and not path.stem.endswith("_curves")}
+    """The recorded tables of a row a run, by name (without the claims, the curves, and what is just being written)."""
+    return {path.stem: _read(path) for path in sorted(folder.glob("*.csv"))
+            if path.stem != "claims" and not path.stem.endswith("_curves") and TEMPORARY not in path.name}
 
 
 def table_problems(name: str, table: pd.DataFrame, folder: Path) -> list[str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 import platform
 import subprocess
 import time
+from contextlib import AbstractContextManager
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
@@ -13,8 +14,8 @@ import numpy as np
 import pandas as pd
 
 from .errors import PdkitError
-from .files import ROOT, atomic_file, atomic_folder, read_json, recover, sha256, write_json
-from .machine import cores
+from .files import ROOT, atomic_file, atomic_folder, locked, read_json, recover, sha256, write_json
+from .machine import cores, cpu_has_bf16
 
 PACKAGES = ("torch", "numpy", "gymnasium", "gymnasium-robotics", "mujoco", "mani-skill", "sapien")
 
@@ -34,7 +35,8 @@ def commit() -> str:
 
 
 def describe_machine() -> dict[str, Any]:
-    """Versions, processor count, threads and the GPU's name (false without one), for the manifest."""
+    """Versions, processor count, threads, whether the CPU computes in bfloat16 (where it does not, bf16=True means float32) and the GPU's
+    name (false without one), for the manifest."""
     import torch
 
     versions = {}
@@ -44,7 +46,7 @@ def describe_machine() -> dict[str, Any]:
         except metadata.PackageNotFoundError:
             versions[name] = None
     return {"python": platform.python_version(), "system": f"{platform.system()} {platform.machine()}", "cores": cores(),
-            "torch_threads": torch.get_num_threads(),
+            "torch_threads": torch.get_num_threads(), "cpu_bf16": cpu_has_bf16(),
             "cuda": torch.cuda.is_available() and torch.cuda.get_device_name(), "versions": versions, "git": commit()}
 
 
@@ -81,6 +83,10 @@ class Run:
 
     def _write_manifest(self) -> None:
         write_json(self.manifest_path, self.manifest)
+
+    def alone(self) -> AbstractContextManager[None]:
+        """Within this block no other process trains in this folder. Raises PdkitError where one does."""
+        return locked(self.folder / "lock", f"Another process is training in {self.folder}; wait for it, or choose another folder.")
 
     @property
     def finished(self) -> bool:

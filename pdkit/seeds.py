@@ -1,4 +1,4 @@
-"""Which seed is used for what. The ranges never overlap, so nothing is tuned on the episodes that are reported."""
+"""Which seed is used for what. Nothing is tuned on the episodes that are reported: no other range meets theirs."""
 from __future__ import annotations
 
 from contextlib import AbstractContextManager
@@ -9,7 +9,7 @@ TEST = 1_000_000  # + i: the episodes of every reported comparison
 SELECT = 2_000_000  # + i: choosing a checkpoint
 TRAIN = 10_000_000  # and above: online training
 DEMOS = 0  # + i: scripted experts (below 1,000,000)
-ROLLOUT = 3_000_000  # + i: episodes recorded from agents
+ROLLOUT = 3_000_000  # + i: episodes recorded from agents, the kit's Adroit demonstrations among them
 
 
 def reported_seeds(num: int) -> list[int]:

@@ -3,14 +3,13 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import fcntl
 import shlex
 from collections.abc import Iterator, Sequence
 
 from . import nb
 from .cli import Parser
 from .errors import PdkitError
-from .files import ROOT, runs_root
+from .files import ROOT, locked, runs_root
 from .main_job import duration
 from .sweep_jobs import bases_to_make, finished, make_jobs, missing, unlike_recorded
 from .sweep_progress import Progress
@@ -49,11 +48,7 @@ def _alone(name: str) -> Iterator[None]:
     """Refuse a second sweep of this name: both would work in the same folders."""
     folder = runs_root() / "sweeps" / name
     nb.folder(folder)
-    with open(folder / "lock", "w") as handle:
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            raise PdkitError(f"The sweep {name} is running already; wait for it, or stop it with Ctrl-C there.") from None
+    with locked(folder / "lock", f"The sweep {name} is running already; wait for it, or stop it with Ctrl-C there."):
         yield
 
 

@@ -16,7 +16,7 @@ from .errors import PdkitError
 from .files import ROOT, read_json, runs_root
 from .imitate import ImitateConfig, configured, untrained
 from .main_job import evaluation_minutes, expected_minutes
-from .methods.registry import base_folder, method_config
+from .methods.registry import base_folder, method_config, trainer_of
 from .policies import Policy, load_policy
 from .policies.base import read_card
 from .profiles import flat
@@ -74,13 +74,17 @@ def _with_task(spec: Spec, cell: dict[str, Any], options: Sequence[str]) -> dict
 def _training(spec: Spec, cell: dict[str, Any], seed: int) -> Job:
     cell = _with_task(spec, DEFAULTS | cell, OPTIONS)
     settings = {name: value for name, value in cell.items() if name not in OPTIONS}
-    base, weights = _base(spec, cell)
+    base, card = _base(spec, cell)
+    given = {"base": card["weights_sha256"]} if card else {}
     config = method_config(cell["method"], cell["task"], cell["profile"], seed, policy=base, **settings)
-    if config.demo_fraction:
-        _demos(cell)
+    if config.demo_fraction or trainer_of(cell["method"]).needs_demos:
+        shown = _demos(cell)
+        if card:
+            demos = sources.learned_from(shown, card, cell.get("num_demos"))
+            given |= {"demos": demos.checksum, "num_demos": demos.num}
     words = ["train", "decorated", *_options(OPTIONS, cell), "--seeds", str(seed), *_set(settings)]
     return _job(spec, cell | {"seed": seed}, {"task": cell["task"], "recipe": cell["recipe"], "seed": seed}, words, like=cell["method"],
-                config=flat(config) | weights,
+                config=flat(config) | given,
                 minutes=spec.minutes or expected_minutes(config, cell["episodes"]))
 
 
@@ -106,15 +110,15 @@ def _as_recorded(spec: Spec, jobs: list[Job]) -> list[Job]:
     return timed
 
 
-def _base(spec: Spec, cell: dict[str, Any]) -> tuple[Policy, dict[str, str]]:
-    """The base policy of a training, and its weights' checksum as `base`; one that has not been made yet is untrained, without one."""
+def _base(spec: Spec, cell: dict[str, Any]) -> tuple[Policy, dict[str, Any]]:
+    """The base policy of a training, and its card; one that has not been made yet is untrained, and its card empty."""
     if not is_made(cell.get("base", ""), spec):
         made = _with_task(spec, BASE_DEFAULTS | spec.bases[cell["base"]], BASE_OPTIONS)
         if made["task"] != cell["task"]:
             raise PdkitError(f"{spec.path.name}: the base policy {cell['base']} is one of {made['task']}, not {cell['task']}.")
         return _configured(made, _settings(made))[1], {}
     folder = ROOT / cell["base"] if "base" in cell else base_folder(cell["method"], cell["task"])
-    return load_policy(folder), {"base": read_card(folder)["weights_sha256"]}
+    return load_policy(folder), read_card(folder)
 
 
 def is_made(base: str, spec: Spec) -> bool:

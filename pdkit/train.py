@@ -20,7 +20,7 @@ from .demos import Demos, sources
 from .demos.cli import Progress
 from .errors import PdkitError
 from .evaluate import evaluate
-from .files import DATA, atomic_file, check_replaceable, read_json, runs_root, write_json
+from .files import DATA, atomic_file, atomic_folder, check_replaceable, read_json, runs_root, write_json
 from .imitate import configured, imitate
 from .methods import METHODS
 from .methods.registry import base_folder as shipped_base
@@ -96,8 +96,13 @@ def parse_settings(settings: list[str], option: str = "--set") -> dict[str, Any]
 
 def base_demos(args) -> Demos:
     """The demonstrations that the arguments name."""
-    demos = sources.given(args.task, args.demos) if args.demos else sources.bundled(args.task)
+    demos = shown_demos(args)
     return demos.first(args.num_demos) if args.num_demos is not None else demos
+
+
+def shown_demos(args) -> Demos:
+    """All demonstrations of the file that the arguments name, or of the kit's."""
+    return sources.given(args.task, args.demos) if args.demos else sources.bundled(args.task)
 
 
 def _base(args) -> int:
@@ -167,12 +172,13 @@ def _decorated(args) -> int:
     for seed in args.seeds:
         base = load_policy(base_folder)
         config = method_config(args.method, args.task, args.profile, seed, policy=base, **settings)
-        if args.num_demos is None:
-            args.num_demos = _demos_of(base_folder)
         print(f"{args.task}, seed {seed}: " + str(differences(config, args.profile) or "the profile unchanged"), flush=True)
         out = Path(args.out or runs_root() / "train") / f"{args.task}-{args.recipe}-seed{seed}"
-        demos = base_demos(args) if config.demo_fraction or trainer_of(args.method).needs_demos else None
-        started_from = origin(read_card(base_folder), demos, encoder, object_set(get_task(args.task)))
+        card, demos = read_card(base_folder), None
+        if config.demo_fraction or trainer_of(args.method).needs_demos:
+            demos = sources.learned_from(shown_demos(args), card, args.num_demos)
+            args.num_demos = demos.num
+        started_from = origin(card, demos, encoder, object_set(get_task(args.task)))
         if encoder and demos:
             demos = encoded(demos, pictures_of(demos, Progress(demos.num, "drawn")), encoder)
         row = decorate(config, base, demos, out, args.episodes, started_from, args.tensorboard, encoder)
@@ -182,10 +188,6 @@ def _decorated(args) -> int:
             curves = pd.read_csv(out / "metrics.csv").assign(task=args.task, seed=seed, recipe=args.recipe)
             record(args.record, pd.DataFrame([row]), curves)
     return 0
-
-
-def _demos_of(folder: Path) -> int | None:
-    return read_card(folder)["info"].get("demos")
 
 
 def command_of(args, seed: int) -> str:
@@ -225,10 +227,11 @@ def decorate(config, base: Policy, demos: Demos | None, out: Path, episodes: int
     if board:
         board.close()
     run.write_metrics(trainer.rows)
-    trainer.save_policy(policy, out / "decorated")
-    if encoder:
-        inside = out / "decorated" / "base"  # of a decorated policy; fine-tuning leaves a plain one
-        save_encoder(encoder, (inside if inside.is_dir() else inside.parent) / ENCODER)
+    with atomic_folder(out / "decorated") as temporary:  # without its encoder it would pass for a policy that is told the state
+        trainer.save_policy(policy, temporary)
+        if encoder:
+            inside = temporary / "base"  # of a decorated policy; fine-tuning leaves a plain one
+            save_encoder(encoder, (inside if inside.is_dir() else temporary) / ENCODER)
     tables = {"base": _base_episodes(base, trainer.spec, episodes, config, started_from),
               "decorated": _episodes(policy, trainer.spec, episodes, config.seed)}
     for name, table in tables.items():
@@ -258,7 +261,8 @@ def _base_episodes(base: Policy, spec: TaskSpec, episodes: int, config: OnlineCo
     once and kept."""
     draw = [config.seed] if base.samples else []
     weights = [started_from[name] for name in ("base", "encoder", "objects") if name in started_from]
-    what = json.dumps([spec.name, config.start_fraction, episodes, *weights, base.kind, base.config, describe_machine()["versions"], *draw])
+    here = describe_machine()
+    what = json.dumps([spec.name, config.start_fraction, episodes, *weights, base.kind, base.config, here["versions"], here["git"], *draw])
     kept = runs_root() / "base_episodes" / f"{spec.name}-{hashlib.sha256(what.encode()).hexdigest()[:16]}.csv"
     if not kept.exists():
         table = _episodes(base, spec, episodes, config.seed)

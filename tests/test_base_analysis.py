@@ -1,5 +1,6 @@
 """What lesson 04 measures and draws: choices in demonstrations, the flattery of selection, curves, gains; and the exercise."""
 import itertools
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -219,5 +220,7 @@ def test_the_exercise_accepts_formula_and_simulation_and_names_mistakes(capsys):
                          (lambda p, n, m: analysis.best_of(p, n, 1) ** (1 / m), "not 0.75")):
         assert not check.best_of(wrong)
         assert words in capsys.readouterr().out, words
+    assert not check.best_of(lambda p, n, m: sys.exit("enough"))  # whatever a student's code does
+    assert "it raised SystemExit: enough" in capsys.readouterr().out
     with pytest.raises(PdkitError, match="best_of"):
         check.best_of(lambda p, n, m: p, strict=True)

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from pdkit.errors import PdkitError
-from pdkit.files import atomic_folder, check_replaceable, recover
+from pdkit.files import atomic_folder, check_replaceable, locked, recover
 
 
 def save(folder, text):
@@ -76,3 +76,23 @@ def test_what_a_killed_process_moved_away_is_put_back(tmp_path, own):
     recover(tmp_path / "checkpoint")
     assert (tmp_path / "checkpoint" / "state.json").read_text() == "old"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["checkpoint", alive.name]
+
+
+def test_one_process_at_a_time_works_behind_a_lock(tmp_path, monkeypatch):
+    path = tmp_path / "lock"
+    other = [sys.executable, "-c", "import sys; from pdkit.files import locked\nwith locked(sys.argv[1], 'busy now'): pass", str(path)]
+    with locked(path, "unused"):
+        held = subprocess.run(other, capture_output=True, text=True)
+    assert held.returncode and "PdkitError: busy now" in held.stderr
+    assert subprocess.run(other).returncode == 0  # it is free again
+    with pytest.raises(PdkitError, match="Cannot write .*lock: No such file"):
+        with locked(tmp_path / "none" / "lock", "unused"):
+            pass
+    monkeypatch.setattr("pdkit.files.fcntl.flock", refuse)
+    with pytest.raises(PdkitError, match="lock cannot be locked: No locks available; choose a folder on another disk"):
+        with locked(path, "unused"):
+            pass
+
+
+def refuse(*_):
+    raise OSError(37, "No locks available")

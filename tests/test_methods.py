@@ -127,8 +127,9 @@ def test_under_a_reward_by_likeness_no_task_ends_an_episode_at_success(method, t
 
 
 @pytest.mark.parametrize(("method", "changes"), [
-    ("ppo_decorator", dict(actor_lr=1e-3)), ("ppo_finetune", dict(batch=64, average=0.0)), ("sac_finetune", dict(log_std_range=(-3.0, 2.0))),
-    ("dipo", dict(actor_value="mean")), ("dppo", dict(tau=0.1)), ("fish", dict(ot_trunk=8)), ("calql_a", dict(calql_pretrained=False)),
+    ("ppo_decorator", dict(actor_lr=1e-3)), ("ppo_finetune", dict(batch=64, average=0.0)),
+    ("sac_finetune", dict(log_std_range=(-3.0, 2.0))), ("dipo", dict(actor_value="mean")), ("dppo", dict(tau=0.1)),
+    ("fish", dict(ot_trunk=8)), ("calql_a", dict(calql_pretrained=False)),
     ("policy_decorator", dict(ppo_lr=1e-3)), ("rot", dict(critic_backbone="shared")), ("jsrl", dict(calql_actions=2))])
 def test_a_setting_that_a_method_does_not_read_is_refused(method, changes):
     """Else a sweep over it would be the same run many times."""

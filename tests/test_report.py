@@ -43,6 +43,11 @@ def test_the_report_prints_the_claims_and_writes_a_page(results, capsys):
     assert "Nothing was run." in html and "Recorded: main" in html and "nan" not in html
 
 
+def test_a_table_that_is_being_written_is_not_read(results, capsys):
+    (results / "main_curves.csv.tmp-123.csv").write_text("half of a li")
+    assert call(results, capsys)[0] == 0
+
+
 @pytest.mark.parametrize("changes, said", [
     ({"verdict": "maybe"}, "has the verdict 'maybe'; known are reproduced, partly, not, untested."),
     ({"verdict": "untested"}, "is untested but has seeds, interval, command"),

@@ -17,6 +17,7 @@ import pytest
 from sweep_jobs import job, play
 
 from pdkit import cli, nb, recorded, sweep, sweep_jobs, sweep_ray, sweep_run
+from pdkit.demos.sources import bundled
 from pdkit.errors import PdkitError
 from pdkit.files import DATA, ROOT, read_json, write_json
 from pdkit.main_job import evaluation_minutes, expected_minutes
@@ -218,11 +219,12 @@ def test_a_job_is_what_its_command_does(tmp_path):
     base = "data/checkpoints/StackCube/diffusion"
     chunked = config(task="StackCube", base=base)
     assert chunked == json.loads(json.dumps(flat(method_config("policy_decorator", "StackCube", policy=load_policy(ROOT / base))))) | {
-        "base": read_card(ROOT / base)["weights_sha256"]}
+        "base": read_card(ROOT / base)["weights_sha256"], "demos": bundled("StackCube").checksum, "num_demos": 300}
     assert chunked["gamma"] == 0.922 != config(task="StackCube")["gamma"]
     unmade = {"runs/none/own": {"task": "StackCube", "policy": "diffusion", "horizon": 8}}  # chunks of 4, as it will have
     path = written(tmp_path, fixed=dict(task="StackCube", base="runs/none/own"), grid={}, bases=unmade)
-    assert sweep_jobs.make_jobs(load_spec(path))[0].config == {name: value for name, value in chunked.items() if name != "base"}
+    assert sweep_jobs.make_jobs(load_spec(path))[0].config == {
+        name: value for name, value in chunked.items() if name not in ("base", "demos", "num_demos")}
     shown = "data/demos/TurnFaucetSource.safetensors"
     assert config(task="TurnFaucet", demos=shown)["task"] == "TurnFaucet"
     with pytest.raises(PdkitError, match="holds demonstrations of TurnFaucetSource, not of Door"):

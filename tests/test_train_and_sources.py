@@ -52,7 +52,8 @@ def test_demonstrations_from_the_command_line(monkeypatch, tmp_path, capsys):
 
 @pytest.mark.parametrize("words", [
     ("demos", "Stackcube"), ("demos",), ("demos", "StackCube", "--num", "0"),
-    ("demos", "StackCube", "--first-seed", "-5"), ("demos", "StackCube", "--first-seed", "99999999999"), ("demos", "Door", "--noise", "-1"),
+    ("demos", "StackCube", "--first-seed", "-5"), ("demos", "Door", "--first-seed", "1000000"), ("demos", "Door", "--first-seed", "999999"),
+     ("demos", "StackCube", "--first-seed", "99999999999"), ("demos", "Door", "--noise", "-1"),
     ("demos", "Door", "--tail", "-200"), ("demos", "--show", "none.safetensors"),
     ("demos", "StackCube", "--source", "human"), ("train", "base", "Door", "--policy", "gan"), ("train", "base", "Pens"),
     ("train", "base", "Door", "--num-demos", "99"), ("train", "base", "Door", "--set", "iterrations=3"),
@@ -172,6 +173,14 @@ def test_training_from_the_command_line_records_a_row_a_seed(monkeypatch, tmp_pa
     assert policy.base.state_dict().keys() == base.state_dict().keys()
     with pytest.raises(PdkitError, match="differing: demos, num_demos"):  # the same folder with other demonstrations is another run
         train.main([*words[1:], "--num-demos", "2"])
+
+
+def test_without_a_number_there_are_as_many_demonstrations_as_the_base_policy_saw():
+    demos = reach_demos(4)
+    assert sources.learned_from(demos, {"info": {"demos": 3}}).num == 3 and sources.learned_from(demos, {"info": {"demos": 3}}, 2).num == 2
+    assert sources.learned_from(demos, {"info": {"demos": 5}}).num == sources.learned_from(demos, {"info": {}}).num == 4  # a smaller file
+    with pytest.raises(PdkitError, match="num_demos must be 1 to 4, not 5"):
+        sources.learned_from(demos, {"info": {}}, 5)
 
 
 def test_a_base_policy_that_samples_is_tested_on_random_numbers_of_each_run(monkeypatch, tmp_path):

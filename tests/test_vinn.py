@@ -98,16 +98,16 @@ def test_demonstrated_observations_give_back_their_actions():
 
 
 def test_exclusion_passes_over_what_came_up_too_often():
-    """One place in the buffer, one visit tolerated: row 0, then it is out; row 1 once, then 1 is out too (and nothing is left, so the
-    last candidate), which lets 0 in again."""
+    """One place in the buffer, one visit tolerated: row 0, then it is out; row 1 once, then 1 is out too, which lets 0 in again, but
+    not for that decision."""
     policy = lookup(k=1, exclusion=1, tolerance=1, history=5)
     stuck = 0.1 + 0.01 * np.arange(5)
     windows = np.stack([np.concatenate([np.full(7 - t, stuck[0]), stuck[1:t]]) for t in range(1, 5)])[..., None].astype(np.float32)
     assert windows.shape == (4, 6, 1) and policy.window == 6
-    assert policy.act(windows)[:, 0, 0].tolist() == [0.0, 0.5, 0.5, 0.0]
+    assert policy.act(windows)[:, 0, 0].tolist() == [0.0, 0.5, -1.0, 0.0]
     twice = lookup(k=1, exclusion=1, tolerance=2, history=5)
     assert twice.act(windows)[:, 0, 0].tolist() == [0.0, 0.0, 0.5, 0.5]
-    longer = lookup(k=1, exclusion=2, tolerance=1, history=5)  # three candidates, of which none is left at the fourth
+    longer = lookup(k=1, exclusion=2, tolerance=1, history=5)  # three rows, of which none is left at the fourth
     assert longer.act(windows)[:, 0, 0].tolist() == [0.0, 0.5, -1.0, -1.0]
 
 

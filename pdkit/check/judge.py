@@ -12,7 +12,7 @@ def judge(name: str, complaints: Callable[[], Iterator[str]], strict: bool) -> b
         wrong = next(complaints(), None)
     except NotImplementedError:
         wrong = "it is still to be written."
-    except Exception as error:  # whatever a student's code may raise
+    except (Exception, SystemExit) as error:  # whatever a student's code may raise
         wrong = f"it raised {type(error).__name__}: {error}"
     if wrong is None:
         print(f"[solved] {name}")

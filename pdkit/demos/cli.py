@@ -11,6 +11,7 @@ import numpy as np
 from ..cli import Parser
 from ..errors import PdkitError
 from ..files import DATA, runs_root
+from ..seeds import ROLLOUT, TEST
 from ..tasks import TASKS, get_task
 from . import sources
 from .experts import EXPERTS
@@ -51,6 +52,9 @@ def main(argv: list[str]) -> int:
     for name, value, most in (("--first-seed", args.first_seed, LAST_SEED), ("--noise", args.noise, 10.0), ("--tail", args.tail, 10_000)):
         if value is not None and not 0 <= value <= most:
             raise PdkitError(f"{name} must be from 0 to {most:,}, not {value}.")
+    if args.first_seed is not None and TEST - 4 * args.num < args.first_seed < ROLLOUT:
+        raise PdkitError(f"Seeds from {TEST:,} to {ROLLOUT - 1:,} are of the episodes by which policies are tested and chosen: take a "
+                         "--first-seed well below or above.")
     get_task(args.task)
     source = args.source or ("scripted" if args.task in EXPERTS else "agent")
     if args.file and source != "hub":

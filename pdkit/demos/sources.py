@@ -52,6 +52,11 @@ def given(task: str, path: str | Path) -> Demos:
     return _warned_of_objects(demos)
 
 
+def learned_from(demos: Demos, card: dict, num: int | None = None) -> Demos:
+    """The first `num` demonstrations; without a number as many as the policy of this card learned from, or all where there are fewer."""
+    return demos.first(min(card["info"].get("demos", demos.num), demos.num) if num is None else num)
+
+
 def scripted(task: str, num: int, first_seed: int = 0, noise: float = 0.0, progress: Callable[[int, int], None] | None = None) -> Demos:
     """`num` successful episodes of the task's scripted expert."""
     command = f"pdkit demos {task} --num {num} --first-seed {first_seed} --noise {noise}"

@@ -72,7 +72,7 @@ def pictures_of(demos: Demos, progress: Callable[[int, int], None] | None = None
     Raises PdkitError when a kept file is truncated, altered or of other demonstrations or cameras, and as `draw` does.
     """
     path = picture_file(demos)
-    if not path.exists():
+    if not (path.exists() and path.with_suffix(".json").exists()):  # the card is written last
         save_pictures(draw(demos, progress), demos, path)
     return load_pictures(demos, path)
 

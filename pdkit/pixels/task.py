@@ -19,6 +19,7 @@ import numpy as np
 import torch
 
 from ..errors import PdkitError
+from ..files import atomic_folder
 from ..policies import Policy, save_policy
 from ..tasks.spec import TaskSpec
 from .cameras import VIEWS
@@ -88,5 +89,6 @@ def save_visual(policy: Policy, encoder: Encoder, folder: str | Path, info: dict
     halved = copy.deepcopy(policy)
     for parameter in halved.parameters():
         parameter.data = parameter.data.bfloat16()
-    save_policy(halved, folder, info)
-    save_encoder(encoder, Path(folder) / ENCODER)
+    with atomic_folder(folder) as temporary:  # without its encoder it would pass for a policy that is told the state
+        save_policy(halved, temporary, info)
+        save_encoder(encoder, temporary / ENCODER)

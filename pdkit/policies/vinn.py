@@ -144,7 +144,9 @@ class VINN(Policy):
         """Rows (N,) of the library after the exclusion buffer of each window has been played through."""
         past = windows.shape[1] - self.looks
         steps = windows.unfold(1, self.looks, 1).transpose(2, 3)  # (N, past + 1, looks, obs_dim)
-        nearest = self._nearest(self.features(steps.flatten(0, 1)), self.config["exclusion"] + 1)[1].view(len(windows), past + 1, -1)
+        # Beside those in the buffer, the ones that a decision itself puts out have to be passed over.
+        enough = min(self.config["exclusion"] + 1 + SPARE, len(self.library))
+        nearest = self._nearest(self.features(steps.flatten(0, 1)), enough)[1].view(len(windows), past + 1, -1)
         # Before an episode's start its first observation repeats: no decision was made there.
         repeats = (windows == windows[:, :1]).all(dim=2).long().cumprod(dim=1).sum(dim=1)
         starts = (repeats - self.looks).clamp(0, past)
@@ -152,7 +154,7 @@ class VINN(Policy):
         return torch.tensor(chosen, device=windows.device)
 
     def _play(self, decisions: list[list[int]]) -> int:
-        """The last choice of a sequence of decisions, each the nearest rows in order."""
+        """The last choice of a sequence of decisions, each the nearest rows in order; where all are out, the farthest of them."""
         out: deque[int] = deque(maxlen=self.config["exclusion"])
         seen: Counter[int] = Counter()
         choice = -1
