@@ -58,12 +58,12 @@ def learner(trainer: FineTune, kind: str, seed: int = 0, **changes: Any) -> SAC:
     return other._make_agent()
 
 
-def critics_alone(trainer: FineTune, kind: str, seed: int = 0) -> SAC:
-    """A learner whose actor takes no step of its own, and whose targets hold rewards alone.
+def critics_alone(trainer: FineTune, kind: str, seed: int = 0, **changes: Any) -> SAC:
+    """A learner whose actor takes no step of its own, and whose targets hold rewards alone; other settings of SAC by name.
 
     The kit refuses such a setting for a shared transformer, because it would move the actor; here that is what is to be seen.
     """
-    agent = learner(trainer, kind, seed, autotune=False, entropy_backup=False)
+    agent = learner(trainer, kind, seed, autotune=False, entropy_backup=False, **changes)
     agent.config = replace(agent.config, critic_warmup=NEVER)
     return agent
 
