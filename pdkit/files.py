@@ -19,6 +19,7 @@ DATA = ROOT / "data"
 
 TEMPORARY = ".tmp-"  # in the name of what is just being written
 
+
 def runs_root() -> Path:
     """Where results go: runs/ in the project, or the folder that PDKIT_RUNS names."""
     return Path(os.environ.get("PDKIT_RUNS") or ROOT / "runs").expanduser().resolve()
@@ -120,7 +121,7 @@ def _alive(pid: str) -> bool:
 @contextlib.contextmanager
 def locked(path: str | Path, busy: str) -> Iterator[None]:
     """Within this block no other process is in one with the same lock file. Raises PdkitError with the sentence `busy` where one is, and
-    where the file cannot be written or locked."""
+    where the file cannot be written. On a disk without locks nobody can be told, and the block runs."""
     try:
         handle = open(path, "a")
     except OSError as error:
@@ -131,7 +132,8 @@ def locked(path: str | Path, busy: str) -> Iterator[None]:
         except BlockingIOError:
             raise PdkitError(busy) from None
         except OSError as error:
-            raise PdkitError(f"{path} cannot be locked: {error.strerror}; choose a folder on another disk.") from None
+            if error.errno not in (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP):
+                raise _told(error, Path(path)) from error
         yield
 
 

@@ -14,6 +14,7 @@ from . import nb, page
 from .cli import Parser
 from .errors import PdkitError
 from .files import ROOT, read_json, runs_root
+from .methods.registry import check_read
 from .online_config import OnlineConfig
 from .plots import Picture
 from .policies import Policy
@@ -153,6 +154,7 @@ def configured(values: dict[str, Any], policy: Policy | None = None) -> OnlineCo
     both = sorted(named.keys() & values.get("changes", {}).keys())
     if both:
         raise PdkitError(f"{both[0]} is given as a parameter and in changes; give it once.")
+    check_read("policy_decorator", values.get("changes", {}))
     task, profile = values.get("task", "Door"), values.get("profile", "lesson")
     over = policy_values(task, profile, policy.kind, policy.chunk) if policy is not None else {}
     return online_config(task, profile, values.get("seed", 0), **over | named | values.get("changes", {}))

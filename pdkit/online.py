@@ -161,13 +161,16 @@ class Trainer:
 
         Raises PdkitError when a loss or weight stops being finite; the last checkpoint is then still good.
         """
+        with run.alone() if run is not None else contextlib.nullcontext():
+            return self._train(run, progress)
+
+    def _train(self, run: Run | None, progress: Callable[[Trainer], None] | None) -> Decorated | Policy:
         c = self.config
         envs = VectorEnv(self.spec, c.num_envs, self._next_seed, window=self.base.window, chunk=self.base.chunk,
                          workers=c.env_workers, simulator=c.simulator,
                          terminate_on_success=c.on_success == "terminate", success_tail=c.success_tail,
                          max_episode_steps=shortened(c.train_limit, c.start_fraction) or None)
-        alone = run.alone() if run is not None else contextlib.nullcontext()
-        with alone, envs, contextlib.closing(self._evaluations()) as evaluations:
+        with envs, contextlib.closing(self._evaluations()) as evaluations:
             windows, base = self._start(envs, run)
             for step, weights in sorted(self._unscored.items()):
                 evaluations.submit(step, weights)
@@ -205,9 +208,9 @@ class Trainer:
             started = time.monotonic()
             self._collect(evaluations, progress, wait=True)
             self.train_seconds += time.monotonic() - started
-        if c.utd and self.agent.updates == self.offline_updates:
-            raise PdkitError(f"Nothing was learned in {self.step:,} steps: the memory holds {self.replay.size} decisions and a batch takes "
-                             f"{c.batch}; take more steps or smaller batches.")
+        if c.utd and not self.agent.updates:
+            raise PdkitError(f"Not one update was made in {self.step:,} steps (warmup_steps {c.warmup_steps:,}, utd {c.utd:g}, batch "
+                             f"{c.batch}): take more steps, a shorter warm-up or smaller batches.")
         return self.result()
 
     def _evaluations(self) -> Evaluations:
@@ -284,7 +287,8 @@ class Trainer:
             score = scores["success_once"]
             if self.config.on_success == "continue":  # then staying solved is learned too
                 score = (score + scores["success_at_end"]) / 2
-            learned = row["updates"] > self.config.sac.critic_warmup  # or it is what the run started from
+            # Else it is what the run, or its online stage, started from; the actor learns every so many updates.
+            learned = row["updates"] >= max(self.offline_updates, self.config.sac.critic_warmup) + self.config.sac.actor_every
             if self.config.select == "best" and learned and step >= max(self.config.decorator.H, 1) and score >= self.best_score:
                 self.best_score, self.best_actor = score, weights
             if progress:

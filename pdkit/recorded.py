@@ -124,7 +124,8 @@ def _machines(path: Path) -> list[dict[str, Any]]:
     this, old = describe_machine(), read_json(path) if path.exists() else {}
     earlier = old.get("machines") or [old[key] for key in ("machine",) if key in old]
     newer = {name: this.get(name) for name in ("git", "torch_threads")}
-    return [machine for machine in earlier if machine | newer != this] + [this]
+    unknown = {"cpu_bf16": this.get("cpu_bf16")}  # which older manifests do not tell
+    return [machine for machine in earlier if unknown | machine | newer != unknown | this] + [this]
 
 
 @contextlib.contextmanager

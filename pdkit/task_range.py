@@ -104,7 +104,9 @@ def _demonstrations(task: str) -> dict[str, object]:
 def _results(rows: pd.DataFrame) -> dict[str, object]:
     first = rows.sort_values("seed").iloc[0]
     episodes = int(first.episodes)
-    base = wilson(round(first.base_success * episodes), episodes)
+    # One that samples was tested on random numbers of each run.
+    tests = rows if first.policy == "diffusion" and rows.base_success.nunique() > 1 else rows[rows.seed == first.seed]
+    base = wilson(round((tests.base_success * tests.episodes).sum()), int(tests.episodes.sum()))
     values = rows.set_index(["task", "seed"]).decorated_success
     interval = mean_interval(values) if len(rows) >= ENOUGH else wilson(round(first.decorated_success * episodes), episodes)
     named = re.search(r"--num-demos (\d+)", str(first.get("command", "")))

@@ -185,7 +185,7 @@ def test_the_offline_stage_is_evaluated_but_not_selected(monkeypatch):
 
     given = iter([1.0, 0.2])
     monkeypatch.setattr(online_eval, "_score", lambda *_: {"success_once": next(given), "success_at_end": 0.0})
-    trainer, _ = run("calql_c", total_steps=600, eval_every=600, eval_episodes=3)
+    trainer, _ = run("calql_c", total_steps=600, eval_every=600, eval_episodes=3, utd=0.5)
     offline = [row for row in trainer.rows if row["step"] == 0]
     assert "success_once" in offline[-1] and not any("success_once" in row for row in offline[:-1])
     assert offline[-1]["success_once"] == 1.0 and 0 < trainer.best_score <= 0.2

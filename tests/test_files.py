@@ -1,4 +1,5 @@
 """Files and folders are replaced whole or not at all, and nothing that is not ours."""
+import errno
 import os
 import subprocess
 import sys
@@ -88,11 +89,12 @@ def test_one_process_at_a_time_works_behind_a_lock(tmp_path, monkeypatch):
     with pytest.raises(PdkitError, match="Cannot write .*lock: No such file"):
         with locked(tmp_path / "none" / "lock", "unused"):
             pass
-    monkeypatch.setattr("pdkit.files.fcntl.flock", refuse)
-    with pytest.raises(PdkitError, match="lock cannot be locked: No locks available; choose a folder on another disk"):
-        with locked(path, "unused"):
-            pass
+    entered = []
+    monkeypatch.setattr("pdkit.files.fcntl.flock", refuse)  # a disk without locks: work goes on
+    with locked(path, "unused"):
+        entered.append(True)
+    assert entered
 
 
 def refuse(*_):
-    raise OSError(37, "No locks available")
+    raise OSError(errno.ENOLCK, "No locks available")

@@ -311,7 +311,7 @@ def test_what_has_not_learned_yet_is_never_the_result(monkeypatch, critic_warmup
 
 
 def test_a_run_that_learned_nothing_is_told():
-    with pytest.raises(PdkitError, match="Nothing was learned in 400 steps: the memory holds 400 decisions and a batch takes 400; take"):
+    with pytest.raises(PdkitError, match="Not one update was made in 400 steps .*batch 400.: take more steps"):
         Trainer(config(batch=400), biased_base(), spec=SPEC).train()
 
 

@@ -18,7 +18,7 @@ from pdkit.decorated import load_decorated
 from pdkit.demos import load_demos, save_demos
 from pdkit.errors import PdkitError
 from pdkit.files import DATA
-from pdkit.policies import load_policy
+from pdkit.policies import BeT, load_policy
 from pdkit.policies.diffusion import DiffusionPolicy
 from pdkit.probes import PROBES, ProbeBase
 from pdkit.profiles import online_config
@@ -198,6 +198,7 @@ def test_a_base_policy_that_samples_is_tested_on_random_numbers_of_each_run(monk
         assert drawn == wanted
     shape = dict(obs_dim=3, act_dim=2, dims=[8])
     assert not DiffusionPolicy(shape | dict(temperature=0.0)).samples and DiffusionPolicy(shape | dict(sampler="ddpm")).samples
+    assert BeT(dict(obs_dim=3, act_dim=2, act_dropout=True)).samples and not BeT(dict(obs_dim=3, act_dim=2)).samples
 
 
 def test_the_command_of_a_row_can_be_pasted_into_a_shell():

@@ -26,7 +26,7 @@ class DPPO(OnPolicy, FineTuneDiffusion):
     """A rollout holds the chains of its decisions."""
 
     reads = ("ppo_", "dppo_", "lora")
-    unread = OnPolicy.unread | FineTuneDiffusion.unread
+    unread = OnPolicy.unread | FineTuneDiffusion.unread | {"ppo_clip", "ppo_entropy_coef"}
 
     def _make_agent(self) -> Learner:
         c, m = self.config, self.config.method_config

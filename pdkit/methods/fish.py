@@ -44,7 +44,7 @@ class FISHAgent(QFilteredSAC):
 class FISH(OTRewarded):
     """The decorator's loop over VINN, rewarded by optimal transport."""
 
-    unread = frozenset({"ot_trunk", "ot_renew_every"})
+    unread = OTRewarded.unread | {"ot_trunk", "ot_renew_every"}
 
     def __init__(self, config, base, demos=None, spec=None):
         if not isinstance(base, VINN):

@@ -39,7 +39,7 @@ class OnPolicy(Trainer):
 
     sees_features = False
     reads = ("ppo_",)
-    unread = frozenset({*SACConfig.__dataclass_fields__, "utd", "batch", "n_step"}
+    unread = frozenset({*SACConfig.__dataclass_fields__, "utd", "batch", "n_step", "warmup", "critic_input", "residual_units"}
                        - {"hidden", "layers", "actor_layer_norm", "critic_layer_norm", "log_std_range"})
 
     def __init__(self, config, base, demos=None, spec=None):

@@ -30,11 +30,11 @@ def method_config(method: str, task: str, profile: str = "lesson", seed: int = 0
     """The configuration of a method on a task: the task's profile, what it sets otherwise over this base policy where the method acts
     in its chunks, then the method's changes, then `changes` (flat names).
 
-    Raises PdkitError for a change that means nothing to the method: two runs that differ in it alone would be the same run.
+    Raises PdkitError for a change that the method's trainer never looks at: two runs that differ in it alone would be the same run.
+    (Settings that others switch off, such as calql_rollouts without calql_data="mixed", are taken.)
     """
     m = get_method(method)
-    if unread := _unread(method, changes):
-        raise PdkitError(f"{m.title} does not read {', '.join(unread)}; leave that out.")
+    check_read(method, changes)
     own = m.changes | {"lesson": m.lesson, "smoke": m.lesson, "paper": m.paper}.get(profile, {})
     sees_state = policy is None or policy.config["obs_dim"] == get_task(task).obs_dim  # and not what an encoder makes of pictures
     chunks = policy is not None and trainer_of(method).chunks
@@ -43,10 +43,12 @@ def method_config(method: str, task: str, profile: str = "lesson", seed: int = 0
     return online_config(task, profile, seed, **({"method": method} | over | own | changes))
 
 
-def _unread(method: str, changes: dict[str, Any]) -> list[str]:
-    """Those of `changes` that the method's trainer does not look at."""
+def check_read(method: str, changes: dict[str, Any]) -> None:
+    """Raises PdkitError for those of `changes` that the method's trainer never looks at."""
     trainer, own = trainer_of(method), MethodConfig.__dataclass_fields__
-    return [name for name in changes if name in trainer.unread or (name in own and not name.startswith(trainer.reads))]
+    unread = [name for name in changes if name in trainer.unread or (name in own and not name.startswith(trainer.reads))]
+    if unread:
+        raise PdkitError(f"{get_method(method).title} does not read {', '.join(unread)}; leave that out.")
 
 
 def base_folder(method: str, task: str) -> Path:

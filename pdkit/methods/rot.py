@@ -52,6 +52,7 @@ class ROT(OTRewarded, FineTune):
     """Fine-tuning with both changes."""
 
     reads = (*OTRewarded.reads, "lora")
+    unread = FineTune.unread | OTRewarded.unread | {"xavier_init"}  # its networks are all given
 
     def _make_agent(self) -> ROTAgent:
         c, m, dim = self.config, self.config.method_config, self.spec.obs_dim

@@ -26,6 +26,7 @@ class OTRewarded(Trainer):
     needs_demos = True
     sees_features = False
     reads = ("ot_", "bc_weight")
+    unread = frozenset({"reward_shift"})  # the reward is another one
     _phi: nn.Module | None = None  # the network in these features, if it is renewed
 
     def __init__(self, config, base, demos=None, spec=None):

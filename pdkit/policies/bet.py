@@ -99,6 +99,10 @@ class BeT(Policy):
         nn.init.zeros_(self.head.bias)
         self.register_buffer("centres", torch.zeros(c["bins"], c["act_dim"]))
 
+    @property
+    def samples(self) -> bool:
+        return self.config["act_dropout"] and self.config["dropout"] > 0
+
     def train(self, mode: bool = True) -> BeT:
         """Switch dropout; with `act_dropout` it stays on."""
         return super().train(mode or self.config["act_dropout"])
