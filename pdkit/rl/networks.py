@@ -80,7 +80,7 @@ class Critics(nn.Module):
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         features = [hidden(x).to(last.weight.dtype) for hidden, last in self.members]
-        # The last layers compute in their own precision always: bfloat16 has steps of 0.0625 between 8 and 16, so that values a residual apart would
-        # come out equal, and whoever compares them (ROT's Q-filter) or learns their difference (a target) would see nothing.
+        # The last layers compute in their own precision always: bfloat16 has steps of 0.0625 between 8 and 16, so that values a residual
+        # apart would come out equal, and whoever compares them (ROT's Q-filter) or learns their difference (a target) would see nothing.
         with torch.autocast(x.device.type, enabled=False):
             return torch.stack([last(seen)[:, 0] for seen, (_, last) in zip(features, self.members, strict=True)])
