@@ -174,7 +174,7 @@ def _imitation(spec: Spec, cell: dict[str, Any], seed: int) -> Job:
 
 def _demos(cell: dict[str, Any]) -> Demos:
     """The demonstrations of a training. Raises PdkitError where there are none, or those of another task."""
-    return sources.given(cell["task"], ROOT / cell["demos"]) if "demos" in cell else sources.bundled(cell["task"])
+    return sources.given(cell["task"], ROOT / cell["demos"] if "demos" in cell else None)
 
 
 def _options(names: Sequence[str], cell: dict[str, Any]) -> list[str]:

@@ -96,13 +96,8 @@ def parse_settings(settings: list[str], option: str = "--set") -> dict[str, Any]
 
 def base_demos(args) -> Demos:
     """The demonstrations that the arguments name."""
-    demos = shown_demos(args)
+    demos = sources.given(args.task, args.demos)
     return demos.first(args.num_demos) if args.num_demos is not None else demos
-
-
-def shown_demos(args) -> Demos:
-    """All demonstrations of the file that the arguments name, or of the kit's."""
-    return sources.given(args.task, args.demos) if args.demos else sources.bundled(args.task)
 
 
 def _base(args) -> int:
@@ -176,7 +171,7 @@ def _decorated(args) -> int:
         out = Path(args.out or runs_root() / "train") / f"{args.task}-{args.recipe}-seed{seed}"
         card, demos = read_card(base_folder), None
         if config.demo_fraction or trainer_of(args.method).needs_demos:
-            demos = sources.learned_from(shown_demos(args), card, args.num_demos)
+            demos = sources.learned_from(sources.given(args.task, args.demos), card, args.num_demos)
             args.num_demos = demos.num
         started_from = origin(card, demos, encoder, object_set(get_task(args.task)))
         if encoder and demos:

@@ -53,7 +53,7 @@ def test_demonstrations_from_the_command_line(monkeypatch, tmp_path, capsys):
 @pytest.mark.parametrize("words", [
     ("demos", "Stackcube"), ("demos",), ("demos", "StackCube", "--num", "0"),
     ("demos", "StackCube", "--first-seed", "-5"), ("demos", "Door", "--first-seed", "1000000"), ("demos", "Door", "--first-seed", "999999"),
-     ("demos", "StackCube", "--first-seed", "99999999999"), ("demos", "Door", "--noise", "-1"),
+    ("demos", "StackCube", "--first-seed", "99999999999"), ("demos", "Door", "--noise", "-1"),
     ("demos", "Door", "--tail", "-200"), ("demos", "--show", "none.safetensors"),
     ("demos", "StackCube", "--source", "human"), ("train", "base", "Door", "--policy", "gan"), ("train", "base", "Pens"),
     ("train", "base", "Door", "--num-demos", "99"), ("train", "base", "Door", "--set", "iterrations=3"),

@@ -44,8 +44,11 @@ def _warned_of_objects(demos: Demos) -> Demos:
     return demos
 
 
-def given(task: str, path: str | Path) -> Demos:
-    """The demonstrations in a file, to learn this task from. Raises PdkitError when they are of another task."""
+def given(task: str, path: str | Path | None) -> Demos:
+    """The demonstrations in a file, to learn this task from, or without one those of the kit. Raises PdkitError when they are of another
+    task."""
+    if not path:
+        return bundled(task)
     demos, wanted = load_demos(path), get_task(task).demo_task or task
     if demos.task != wanted:
         raise PdkitError(f"{path} holds demonstrations of {demos.task}, not of {wanted}.")
