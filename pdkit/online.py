@@ -161,10 +161,6 @@ class Trainer:
 
         Raises PdkitError when a loss or weight stops being finite; the last checkpoint is then still good.
         """
-        with run.alone() if run is not None else contextlib.nullcontext():
-            return self._train(run, progress)
-
-    def _train(self, run: Run | None, progress: Callable[[Trainer], None] | None) -> Decorated | Policy:
         c = self.config
         envs = VectorEnv(self.spec, c.num_envs, self._next_seed, window=self.base.window, chunk=self.base.chunk,
                          workers=c.env_workers, simulator=c.simulator,

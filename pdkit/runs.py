@@ -85,8 +85,8 @@ class Run:
         write_json(self.manifest_path, self.manifest)
 
     def alone(self) -> AbstractContextManager[None]:
-        """Within this block no other process trains in this folder. Raises PdkitError where one does."""
-        return locked(self.folder / "lock", f"Another process is training in {self.folder}; wait for it, or choose another folder.")
+        """Within this block no other process works in this folder. Raises PdkitError where one does."""
+        return locked(self.folder / "lock", f"Another process is at work in {self.folder}; wait for it, or choose another folder.")
 
     @property
     def finished(self) -> bool:

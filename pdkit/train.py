@@ -207,7 +207,26 @@ def decorate(config, base: Policy, demos: Demos | None, out: Path, episodes: int
     """
     trainer = make_trainer(config, base, demos, pixel_spec(get_task(config.task), encoder) if encoder else None)
     run = Run(out, "decorated", flat(config) | started_from)  # after what may be refused
-    board, shown = Board(out) if tensorboard else None, set()
+    with run.alone():
+        policy = _trained(trainer, run, tensorboard, encoder)
+        tables = {"base": _base_episodes(base, trainer.spec, episodes, config, started_from),
+                  "decorated": _episodes(policy, trainer.spec, episodes, config.seed)}
+        for name, table in tables.items():
+            with atomic_file(out / f"{name}_episodes.csv") as temporary:
+                table.to_csv(temporary, index=False)
+        row = dict(task=config.task, method=config.method, policy=base.kind, seed=config.seed,
+                   train_minutes=round(trainer.train_seconds / 60, 2), cores=describe_machine()["cores"], env_steps=trainer.step,
+                   first_reward_step=trainer.first_reward or None,
+                   updates=trainer.agent.updates, episodes=episodes,
+                   **_outcome("base", tables["base"]), **_outcome("decorated", tables["decorated"]),
+                   load_average=round(os.getloadavg()[0], 1) if hasattr(os, "getloadavg") else None)
+        run.finish(**row)
+    return row
+
+
+def _trained(trainer: Trainer, run: Run, tensorboard: bool, encoder: Encoder | None) -> Decorated | Policy:
+    """The policy that a run ends with, after saving it and the run's metrics; its evaluations are told while it trains."""
+    board, shown = Board(run.folder) if tensorboard else None, set()
 
     def show(t: Trainer) -> None:
         if board:
@@ -222,24 +241,12 @@ def decorate(config, base: Policy, demos: Demos | None, out: Path, episodes: int
     if board:
         board.close()
     run.write_metrics(trainer.rows)
-    with atomic_folder(out / "decorated") as temporary:  # without its encoder it would pass for a policy that is told the state
+    with atomic_folder(run.folder / "decorated") as temporary:  # without its encoder it would pass for a policy that is told the state
         trainer.save_policy(policy, temporary)
         if encoder:
             inside = temporary / "base"  # of a decorated policy; fine-tuning leaves a plain one
             save_encoder(encoder, (inside if inside.is_dir() else temporary) / ENCODER)
-    tables = {"base": _base_episodes(base, trainer.spec, episodes, config, started_from),
-              "decorated": _episodes(policy, trainer.spec, episodes, config.seed)}
-    for name, table in tables.items():
-        with atomic_file(out / f"{name}_episodes.csv") as temporary:
-            table.to_csv(temporary, index=False)
-    row = dict(task=config.task, method=config.method, policy=base.kind, seed=config.seed,
-               train_minutes=round(trainer.train_seconds / 60, 2), cores=describe_machine()["cores"], env_steps=trainer.step,
-               first_reward_step=trainer.first_reward or None,
-               updates=trainer.agent.updates, episodes=episodes,
-               **_outcome("base", tables["base"]), **_outcome("decorated", tables["decorated"]),
-               load_average=round(os.getloadavg()[0], 1) if hasattr(os, "getloadavg") else None)
-    run.finish(**row)
-    return row
+    return policy
 
 
 def _episodes(actor: Policy | Decorated, spec: TaskSpec, episodes: int, draw: int) -> pd.DataFrame:

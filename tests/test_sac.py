@@ -72,11 +72,16 @@ def test_of_many_critics_the_target_takes_the_least_of_those_drawn():
     residual, _ = agent.actor.sample(data["next_obs"], noise)
     values = agent.targets(torch.cat([data["next_obs"], data["next_base"] + 0.3 * residual], -1))
     for members in ([0, 3], [4, 1]):
-        y = agent.td_target(data, data["next_obs"], noise, torch.tensor(0.5), torch.tensor(members))
+        y = agent.td_target(data, data["next_obs"], noise, torch.tensor(0.5), members)
         assert torch.allclose(y, data["reward"] + 0.9 * torch.minimum(*values[members]), atol=1e-5)
         assert (y > data["reward"] + 0.9 * values.min(0).values + 1e-3).any()  # not the least of all
+    computed = []
+    for member in agent.targets.members:
+        member[0].register_forward_hook(lambda *_: computed.append(1))
+    agent.td_target(data, data["next_obs"], noise, torch.tensor(0.5), [0, 3])
+    assert len(computed) == 2  # the others would cost as much, and nobody asks for their values
     drawn, target = [], agent.td_target
-    agent.td_target = lambda *given: drawn.append(tuple(sorted(given[-1].tolist()))) or target(*given)
+    agent.td_target = lambda *given: drawn.append(tuple(sorted(given[-1]))) or target(*given)
     g = torch.Generator().manual_seed(0)
     for _ in range(40):
         agent.update(data, g)

@@ -22,6 +22,7 @@ from pdkit.policies import BeT, load_policy
 from pdkit.policies.diffusion import DiffusionPolicy
 from pdkit.probes import PROBES, ProbeBase
 from pdkit.profiles import online_config
+from pdkit.runs import Run
 from pdkit.seeds import reported_seeds
 from pdkit.tasks import TASKS, get_task
 from pdkit.tensorboard import Board
@@ -154,9 +155,19 @@ def test_agent_episodes_are_what_the_simulator_did(monkeypatch):
 def test_training_from_the_command_line_records_a_row_a_seed(monkeypatch, tmp_path):
     monkeypatch.setattr(recorded, "DATA", tmp_path)
     monkeypatch.setenv("PDKIT_RUNS", str(tmp_path / "runs"))
+    refused = []
+    for owner, name, work in ((train.Trainer, "train", train.Trainer.train), (train, "_episodes", train._episodes)):  # each writes files
+        def watched(*given, work=work):
+            with pytest.raises(PdkitError, match="Another process is at work in .*Door-lesson-seed0"):
+                with Run.alone(SimpleNamespace(folder=tmp_path / "runs" / "train" / "Door-lesson-seed0")):
+                    pass
+            refused.append(1)
+            return work(*given)
+
+        monkeypatch.setattr(owner, name, watched)
     words = ["train", "decorated", "Door", "--profile", "smoke", "--seeds", "0", "--episodes", "2", "--record", "t",
              "--set", "eval_episodes=1"]
-    assert call(monkeypatch, *words) == 0
+    assert call(monkeypatch, *words) == 0 and len(refused) == 3  # while it trains, and while base and decorated are tested
     assert call(monkeypatch, *words) == 0  # finished already: the same row, not a second one
     table = pd.read_csv(tmp_path / "results" / "t.csv")
     assert len(table) == 1 and table.env_steps[0] >= 600 and table.command[0].startswith("pdkit train decorated Door --profile smoke")

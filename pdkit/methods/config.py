@@ -10,7 +10,7 @@ CRITIC_BACKBONES = ("mlp", "shared", "separate")
 
 @dataclass(frozen=True)
 class MethodConfig:
-    """Only the method named in a comment reads its fields."""
+    """The methods named in a field's comment read it; the others refuse it (`registry.check_read`)."""
 
     lora: int = 8  # fine-tuning: rank of the adapters (the paper gives none); 0 trains all weights
     critic_backbone: str = "mlp"  # fine-tuning: what critics see the window through (pdkit/rl/gpt_critic.py; appendix F.5.1)

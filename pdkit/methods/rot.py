@@ -33,8 +33,8 @@ class TrunkCritics(Critics):
         super().__init__(trunk + act_dim, hidden, layers, num, layer_norm)
         self.trunk, self.obs_dim = nn.Sequential(nn.Linear(obs_dim, trunk), nn.LayerNorm(trunk), nn.Tanh()), obs_dim
 
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        return super().forward(torch.cat([self.trunk(x[..., : self.obs_dim]), x[..., self.obs_dim:]], dim=-1))
+    def seen(self, x: torch.Tensor) -> torch.Tensor:
+        return torch.cat([self.trunk(x[..., : self.obs_dim]), x[..., self.obs_dim:]], dim=-1)
 
 
 class ROTAgent(QFilteredSAC):

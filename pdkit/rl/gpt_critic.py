@@ -61,11 +61,11 @@ class GPTCritics(Critics):
         self.held = hold
         self.members.requires_grad_(not hold)
 
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        seen, further = x[..., : self.backbone.in_dim], x[..., self.backbone.in_dim:]
+    def seen(self, x: torch.Tensor) -> torch.Tensor:
+        window, further = x[..., : self.backbone.in_dim], x[..., self.backbone.in_dim:]
         with torch.set_grad_enabled(torch.is_grad_enabled() and not self.held):
-            features = self.backbone(seen)
-        return super().forward(torch.cat([features, further], dim=-1))
+            features = self.backbone(window)
+        return torch.cat([features, further], dim=-1)
 
 
 class GPTSAC(SAC):

@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
 import torch.nn.functional as F
@@ -67,7 +68,7 @@ class Actor(nn.Module):
 
 
 class Critics(nn.Module):
-    """An ensemble of independent Q-functions: (B, in_dim) -> (num, B)."""
+    """An ensemble of independent Q-functions: (B, in_dim) -> (num, B), or only those of some members."""
 
     def __init__(self, in_dim: int, hidden: int, layers: int, num: int, layer_norm: bool):
         super().__init__()
@@ -78,9 +79,15 @@ class Critics(nn.Module):
             nn.init.zeros_(last.bias)
             self.members.append(nn.Sequential(mlp([in_dim, *[hidden] * layers], layer_norm), last))
 
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        features = [hidden(x).to(last.weight.dtype) for hidden, last in self.members]
+    def seen(self, x: torch.Tensor) -> torch.Tensor:
+        """What the members see of a row: all of it."""
+        return x
+
+    def forward(self, x: torch.Tensor, members: Sequence[int] | None = None) -> torch.Tensor:
+        x = self.seen(x)
+        asked = list(self.members) if members is None else [self.members[i] for i in members]
+        features = [hidden(x).to(last.weight.dtype) for hidden, last in asked]
         # The last layers compute in their own precision always: bfloat16 has steps of 0.0625 between 8 and 16, so that values a residual
         # apart would come out equal, and whoever compares them (ROT's Q-filter) or learns their difference (a target) would see nothing.
         with torch.autocast(x.device.type, enabled=False):
-            return torch.stack([last(seen)[:, 0] for seen, (_, last) in zip(features, self.members, strict=True)])
+            return torch.stack([last(f)[:, 0] for f, (_, last) in zip(features, asked, strict=True)])

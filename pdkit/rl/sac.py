@@ -128,7 +128,7 @@ class SAC:
         noise = torch.randn((2, *batch["base"].shape), generator=generator).to(self.device)
         temperature = self.log_temperature.detach().exp()
         c = self.config
-        members = torch.randperm(c.num_critics, generator=generator)[: c.target_subset] if c.target_subset else None
+        members = torch.randperm(c.num_critics, generator=generator)[: c.target_subset].tolist() if c.target_subset else None
         log = self._update_critics(batch, obs, next_obs, noise[0], temperature, members) if critics else {}
         if self.updates % self.config.actor_every == 0:
             log |= self._update_actor(batch, obs, noise[1], temperature)
@@ -137,13 +137,15 @@ class SAC:
         self.updates += 1
         return log
 
-    def td_target(self, batch, next_obs, noise, temperature, members: torch.Tensor | None = None) -> torch.Tensor:
+    def td_target(self, batch, next_obs, noise, temperature, members: list[int] | None = None) -> torch.Tensor:
         """y, (B,); the least of the target critics `members`, or of all."""
         with torch.no_grad(), autocast(self.device, self.config.bf16):
             residual, log_pi = self.actor.sample(actor_features(self.decorator, next_obs, batch["next_base"]), noise)
             features = critic_features(self.decorator, self.critic_view(next_obs), batch["next_base"], residual)
-            values = self.targets(features)
-            value = (values if members is None else values[members]).min(dim=0).values
+            if self.config.compile and members:  # all are computed: each choice of members would be compiled for itself
+                value = self.targets(features)[members].min(dim=0).values
+            else:
+                value = self.targets(features, members).min(dim=0).values
             if self.config.entropy_backup:
                 value = value - temperature * log_pi
             return batch["reward"] + batch["discount"] * value
