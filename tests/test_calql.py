@@ -98,6 +98,24 @@ def batch(mc=0.0):
             "log_here": torch.tensor([[0.3]]), "log_ahead": torch.tensor([[-0.7]])}
 
 
+def test_the_max_compares_state_by_state():
+    """Two states with three actions of each kind: V lies above every action of one and below every one of the other. The bound of one
+    state does not reach the other, and every action is valued where it was drawn."""
+    parts = [batch(mc) | {"obs": torch.full((1, 1), s)} for mc, s in ((10.0, 2.0), (-10.0, 4.0))]
+    both = {name: torch.cat([p[name] for p in parts], dim=1 if name in ("random", "here", "ahead", "log_here", "log_ahead") else 0)
+            for name in parts[0]}
+    many = lambda p: p | {name: torch.cat([p[name], p[name] * 0.5, p[name] * 0.2])  # noqa: E731
+                          for name in ("random", "here", "ahead", "log_here", "log_ahead")}
+    learner = by_formula(agent(Conservative(actions=3, scale=1.0)), lambda s, a, _: s + a)
+    alone = [learner._critic_penalty(many(p), p["obs"], torch.zeros(2, 1)).item() for p in parts]
+    together = learner._critic_penalty(many(both), both["obs"], torch.zeros(2, 2)).item()
+    assert together == pytest.approx(sum(alone) / 2, rel=1e-5) and abs(alone[0] - alone[1]) > 1
+    pushes = torch.zeros(2, requires_grad=True)
+    learner = by_formula(agent(), lambda s, a, _: (pushes[0] * (s == 2) + pushes[1] * (s == 4)) * (a < 0))
+    learner._critic_penalty(both, both["obs"], torch.zeros(2, 2)).backward()
+    assert pushes.grad[0] == 0 and pushes.grad[1] > 0.1
+
+
 def penalty(mc, **rule):
     learner = by_formula(agent(Conservative(**dict(actions=1, scale=1.0) | rule)), lambda s, a, _: s + a)
     values = torch.tensor([[2.0], [3.0]])

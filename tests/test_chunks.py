@@ -1,4 +1,5 @@
 """Base policies that decide on several actions at once: steps stay primitive, a decision is one transition of the learner."""
+import dataclasses
 import types
 
 import numpy as np
@@ -49,6 +50,20 @@ def test_demonstrations_begin_a_chunk_at_every_step():
         assert np.allclose(after[row], episode["observations"][min(t + 2, length)])
         ends = t + 2 >= length
         assert (reward[row, 0], discount[row, 0]) == ((0, 0) if ends else (-1, np.float32(0.9)))
+
+
+def test_a_trainers_demonstrations_end_as_its_task_keeps_still():
+    """Displacements that went on in the last chunk would be imitated by the critics' data."""
+    demos = reach_demos(2)
+    for moving, wanted in ((dict(absolute_actions=False, held_actions=(1,)), lambda a: [0, a[1]]), (dict(absolute_actions=True), list)):
+        spec = dataclasses.replace(PROBES["reach"], **moving)
+        base = TwoAtOnce(dict(obs_dim=4, act_dim=2, kind="zero"))
+        trainer = reach_trainer("residual_rl", base, demos, spec, demo_fraction=0.25, n_step=1)
+        rows = np.stack(trainer._demo_rows(demos))
+        last = demos.episode(0)["actions"][-1]
+        seen = demos.episode(0)["observations"][-2]
+        ends = rows[(rows[:, :4] == seen).all(axis=1)]
+        assert len(ends) == 1 and np.allclose(ends[0, 4:8], [*last, *wanted(last)], atol=1e-6)
 
 
 def test_several_steps_ahead_are_several_decisions_ahead():
@@ -171,8 +186,8 @@ def test_the_papers_budgets_count_chunks_and_ours_primitive_steps():
     assert policy_values("StackCube", "lesson", "diffusion", 4) == {"gamma": 0.922, "n_step": 2}  # 0.98 and 5 a step
 
 
-@pytest.mark.parametrize("chunk", [2, 4, 16])  # the lengths that the paper's policies decide on
-def test_the_decorator_trains_over_chunks_of_the_papers_lengths(chunk):
+@pytest.mark.parametrize("chunk", [2, 4, 16])  # 4 is the paper's, which sees 2 observations and predicts 16 actions
+def test_the_decorator_trains_over_chunks(chunk):
     base = DiffusionPolicy(dict(obs_dim=4, act_dim=2, window=2, horizon=20 if chunk == 16 else 8, chunk=chunk, dims=[16, 32], groups=4,
                                 embed=16, sampler_steps=2))
     trainer = reach_trainer("policy_decorator", base, total_steps=500, warmup_steps=200, utd=0.1, batch=16)

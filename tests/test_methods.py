@@ -229,6 +229,9 @@ def test_from_scratch_nothing_of_the_base_is_used(method, steps):
     trainer, policy = run(method, biased_base(), reach_demos(), total_steps=steps, warmup_steps=1000)
     rows = trainer.replay.unpack(trainer.replay.rows[: trainer.replay.size])
     assert (rows["base"] == 0).all() and success("reach", policy) > 0.9
+    assert (trainer.demos is None) == (method == "sac_from_scratch")
+    for profile in ("lesson", "paper"):
+        assert method_config(method, "Door", profile).demo_fraction == (0.5 if method == "rlpd" else 0.0)
 
 
 @pytest.mark.parametrize("method", ["rlpd", "rlpd_paper"])

@@ -247,14 +247,15 @@ def test_what_training_stores(method, beside, bet_sac):
 # ---- Q-filter --------------------------------------------------------------------------------------------------------
 
 class Known(torch.nn.Module):
-    """A critic whose value is the sum over actions of `sign` times their square; features end with the action."""
+    """Two critics: the sum over actions of `sign` times their square, and 1 more; features end with the action."""
 
     def __init__(self, sign):
         super().__init__()
         self.sign, self.members = sign, torch.nn.ModuleList()
 
     def forward(self, x):
-        return (self.sign * x[..., -2:].square().sum(-1)).expand(2, -1)
+        value = self.sign * x[..., -2:].square().sum(-1)
+        return torch.stack([value + 1, value])
 
 
 def batch_for(t, num=8):
@@ -271,7 +272,7 @@ def test_q_filter_weight_and_loss(method, better, weight, beside, bet_sac, monke
     imitated = torch.full((8, 2), 0.3)
     monkeypatch.setattr(agent, "reference", lambda batch: imitated)
     agent.critics = Known(1.0)
-    at_reference = agent.critics(torch.cat([batch["obs"], imitated * t.config.decorator.alpha], -1))[0]
+    at_reference = agent.critics(torch.cat([batch["obs"], imitated * t.config.decorator.alpha], -1))[1]
     value = at_reference + {"imitation": -0.1, "actor": 0.1, "half": torch.tensor([-0.1, 0.1] * 4)}[better]
     assert agent.filter_weight(batch, agent.normalize(batch["obs"]), value).item() == weight
     monkeypatch.setattr(agent, "imitation_loss", lambda generator: torch.tensor(50.0))
@@ -285,7 +286,7 @@ def test_the_filter_compares_with_the_least_critic_of_the_imitated_action(beside
     for sign, weight in ((-1.0, 1.0), (1.0, 0.0)):
         t = trainer("fish", vinn(beside, k=1))
         t.agent.critics = Known(sign)
-        value = t.agent.critics(torch.full((8, 2), 0.1))[0]
+        value = t.agent.critics(torch.full((8, 2), 0.1))[1]
         assert t.agent.filter_weight(batch_for(t), batch_for(t)["obs"], value).item() == weight
 
 

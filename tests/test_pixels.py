@@ -4,6 +4,7 @@ import dataclasses
 import json
 import pickle
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -78,9 +79,10 @@ def drawable(task):
 # ---- what is seen ----------------------------------------------------------------------------------------------------
 
 def test_views_are_the_papers():
-    assert {name: (v.height, v.width, v.channels, v.state_dim) for name, v in VIEWS.items() if not name.endswith("Source")} == {
-        "StackCube": (64, 64, 8, 32), "PegInsertionSide": (64, 64, 8, 32), "TurnFaucet": (64, 64, 8, 39), "PushChair": (50, 125, 12, 68),
-        "Door": (128, 128, 3, 27), "Pen": (128, 128, 3, 24), "Hammer": (128, 128, 3, 26), "Relocate": (128, 128, 3, 30)}
+    assert {name: (v.height, v.width, v.channels, v.state_dim, v.shift) for name, v in VIEWS.items() if not name.endswith("Source")} == {
+        "StackCube": (64, 64, 8, 32, 0), "PegInsertionSide": (64, 64, 8, 32, 0), "TurnFaucet": (64, 64, 8, 39, 2),
+        "PushChair": (50, 125, 12, 68, 0), "Door": (128, 128, 3, 27, 4), "Pen": (128, 128, 3, 24, 4), "Hammer": (128, 128, 3, 26, 4),
+        "Relocate": (128, 128, 3, 30, 4)}
     assert view_of("StackCube").bytes == 64 * 64 * 2 * (3 + 2) and view_of("Door").bytes == 49_152
     with pytest.raises(PdkitError, match="No cameras are set up for 'Doors'; choose one of"):
         view_of("Doors")
@@ -157,6 +159,63 @@ def test_the_realsense_is_drawn_with_few_triangles(task, monkeypatch):
     assert (np.abs(coarse[0][:, base] - fine[0][:, base]) > 8).mean() < 0.002
     np.testing.assert_array_equal(coarse[0][:, hand], fine[0][:, hand])
     assert (np.abs(coarse[1] - fine[1]) > 10).mean() < 0.001  # a centimetre
+
+
+class Lens:
+    """Stands for SAPIEN's camera: what it sees is how far off its place on the robot is."""
+
+    def __init__(self, width, height):
+        self.size, self.holder = (height, width), None
+
+    def set_fovy(self, angle, compute_x):
+        self.fovy = np.rad2deg(angle)
+
+    def set_local_pose(self, pose):
+        self.pose = pose
+
+    def take_picture(self):
+        self.taken = True
+
+    def get_picture(self, name):
+        distance = {"holder": 1000, "panda_hand": 250, "mobile_base": 2000}[self.holder]
+        pixel = {"Color": [distance // 10, 7, 9, 255], "PositionSegmentation": [50, 60, -distance, 3]}[name]
+        assert self.taken
+        return np.broadcast_to(np.array(pixel, np.uint8 if name == "Color" else np.int16), (*self.size, 4))
+
+
+@pytest.mark.parametrize(("task", "seen", "angles"), [("StackCube", [1000, 250], [90, 90]), ("PushChair", [2000] * 3, [60] * 3)])
+def test_maniskill_cameras_without_a_graphics_driver(task, seen, angles, monkeypatch):
+    """Which camera is where, in which order, how much it sees, and the unit of its distances (facts.md 2.2: 1/1024 m)."""
+    import mani_skill.render.shaders as shaders
+    import sapien
+
+    lenses, packs = [], []
+
+    def holding(name):
+        return SimpleNamespace(add_component=lambda lens: setattr(lens, "holder", name) or lenses.append(lens), set_pose=lambda pose: None)
+
+    monkeypatch.setattr(sapien.render, "RenderCameraComponent", Lens)
+    monkeypatch.setattr(sapien, "Entity", lambda: holding("holder"))
+    monkeypatch.setattr(shaders, "set_shader_pack", packs.append)
+    monkeypatch.setattr(sapien_eyes, "_coarsen_realsense", lambda env: None)
+    links = {name: SimpleNamespace(_objs=[SimpleNamespace(entity=holding(name))]) for name in ("mobile_base", "panda_hand")}
+    scene = SimpleNamespace(sub_scenes=[SimpleNamespace(update_render=lambda: None, add_entity=lambda holder: None)])
+    env = SimpleNamespace(agent=SimpleNamespace(robot=SimpleNamespace(links_map=links)), scene=scene,
+                          _default_sensor_configs=[SimpleNamespace(pose=SimpleNamespace(sp=None))])
+    view, eyes = view_of(task), sapien_eyes.SapienEyes(view_of(task), SimpleNamespace(_env=env))
+    for _ in range(2):  # the cameras are placed once
+        colours, distances = eyes.look()
+    assert [lens.fovy for lens in lenses] == pytest.approx(angles) and len(packs) == len(angles)
+    assert colours.shape == (3 * len(seen), view.height, view.width) and distances.shape == (len(seen), view.height, view.width)
+    assert [int(d[0, 0]) for d in distances] == [round(mm / 1000 * 1024) for mm in seen] and (distances == distances[:, :1, :1]).all()
+    assert colours[:, 0, 0].tolist() == [number for mm in seen for number in (mm // 10 % 256, 7, 9)]
+    if task == "PushChair":  # on a mast of 1.5 m, a third of a turn apart, looking down by 45 degrees
+        ahead = [lens.pose.to_transformation_matrix()[:3, 0] for lens in lenses]
+        assert all(lens.pose.p.tolist() == [0, 0, 1.5] for lens in lenses)
+        np.testing.assert_allclose([v[2] for v in ahead], -np.sqrt(0.5), atol=1e-5)
+        np.testing.assert_allclose(np.sort(np.diff(np.sort([np.arctan2(v[1], v[0]) for v in ahead]))), 2 * np.pi / 3, atol=1e-4)
+    else:  # in the frame of the hand, whose z runs along the fingers: there it looks
+        np.testing.assert_allclose(lenses[1].pose.to_transformation_matrix()[:3, 0], [0, 0, 1], atol=1e-6)
 
 
 @pytest.mark.slow
@@ -365,13 +424,16 @@ def sighted():
 
 def test_pictures_are_shifted_while_a_policy_learns_from_them(monkeypatch):
     monkeypatch.setitem(pixel_sim.EYES, "probe", Painted)
-    demos, shifts = reach_demos(2), []
+    demos, shifts, sevens, moved = reach_demos(2), [], [], dataclasses.replace(REACH, shift=3)
     pictures = draw(demos, spec=PROBES["reach"], view=REACH)
     config = ImitateConfig(iterations=3, batch=8, eval_episodes=0, bf16=False)
-    monkeypatch.setattr(learn, "random_shift", lambda seen, pad, generator: shifts.append(pad) or seen)
-    for shift in (0, 2):
-        imitate_pixels("mlp", demos, pictures, config, {"hidden": 16}, spec=PROBES["reach"], view=REACH, shift=shift)
-    assert shifts == [2, 2, 2]
+    monkeypatch.setattr(learn, "random_shift", lambda seen, pad, generator: shifts.append(pad) or torch.full_like(seen, 7))
+    forward = Encoder.forward
+    monkeypatch.setattr(Encoder, "forward", lambda self, rgb, depth: sevens.append(bool((rgb == 7).all())) or forward(self, rgb, depth))
+    for view, shift, shifted in ((REACH, None, 0), (moved, 0, 0), (moved, None, 3), (REACH, 2, 2)):
+        shifts.clear(), sevens.clear()
+        imitate_pixels("mlp", demos, pictures, config, {"hidden": 16}, spec=PROBES["reach"], view=view, shift=shift)
+        assert shifts == 3 * [shifted] * (shifted > 0) and sum(sevens) == 3 * (shifted > 0)  # what is shifted is what is seen
 
 
 def test_what_imitation_leaves(sighted):

@@ -470,9 +470,11 @@ def test_the_same_sweep_does_not_run_twice_at_once(tmp_path, results, capsys):
     assert "is running already" in capsys.readouterr().err
 
 
-def test_a_notebook_is_run_with_each_value_and_its_result_becomes_a_row(tmp_path, results, monkeypatch):
-    books = ROOT / "notebooks"
-    end = "from pdkit import nb\nnb.finish({'seen': word * 2, 'part': {'total': sum(list) + seed}, 'all': list}, out)"
+def test_a_notebook_is_run_with_each_value_and_its_result_becomes_a_row(tmp_path, results, monkeypatch, capsys):
+    """One that fails is told with its error, costs the others nothing, and is all that a second go runs."""
+    books, mended = ROOT / "notebooks", tmp_path / "mended"
+    end = f"import os\nassert word != 'broken' or os.path.exists({str(mended)!r}), 'no, the word is broken'\nfrom pdkit import nb\n" \
+          "nb.finish({'seen': word * 2, 'part': {'total': sum(list) + seed}, 'all': list}, out)"
     cells = [nbformat.v4.new_code_cell('profile = "smoke"  # p\nout = ""  # o\nseed = 0  # s\nword = "x"  # w\nlist = [0]  # l'),
              nbformat.v4.new_code_cell(end)]
     cells[0].metadata["tags"] = ["parameters"]
@@ -484,12 +486,19 @@ def test_a_notebook_is_run_with_each_value_and_its_result_becomes_a_row(tmp_path
                                            "cells": [{"word": "c", "recipe": "c"}]})
         assert cli.main(["sweep", str(spec)]) == 2  # a blank in a name
         spec = written(tmp_path, **BOOK | {"fixed": {"notebook": name, "list": [2, 3]}, "grid": None, "seeds": [4],
-                                           "cells": [{"word": "a b", "recipe": "ab"}, {"word": "1", "recipe": "one"}]})
-        assert cli.main(["sweep", str(spec), "--record", "book"]) == 0
+                                           "cells": [{"word": "a b", "recipe": "ab"}, {"word": "broken", "recipe": "bad"},
+                                                     {"word": "1", "recipe": "one"}]})
+        assert cli.main(["sweep", str(spec), "--record", "book", "--workers", "1"]) == 1
+        told = [line for line in capsys.readouterr().out.splitlines() if line.startswith("FAILED")]
+        assert len(told) == 1 and "bad" in told[0] and "no, the word is broken" in told[0]
+        assert list(pd.read_csv(results / "book.csv").recipe) == ["ab", "one"]
+        mended.touch()
+        assert cli.main(["sweep", str(spec), "--record", "book", "--workers", "1"]) == 0
+        assert "3 jobs, 2 finished, 1 to do" in capsys.readouterr().out
     finally:
         path.unlink()
     table = pd.read_csv(results / "book.csv", dtype=str)
-    assert list(table.seen) == ["a ba b", "11"] and list(table["part.total"]) == ["9", "9"] and list(table.seed) == ["4", "4"]
+    assert list(table.seen) == ["a ba b", "brokenbroken", "11"] and set(table["part.total"]) == {"9"} and set(table.seed) == {"4"}
     assert "all" not in table and not (results / "book_curves.csv").exists() and nb.notebooks().get(name) is None
 
 
