@@ -79,7 +79,7 @@ def trail(agent: SAC, replay: Replay, count: int, windows: np.ndarray, test: dic
     reference = agent.actor.act(windows)[:, 0]
 
     def row() -> dict[str, float]:
-        return {"update": agent.updates, "drift": drift(agent.actor, windows, reference), "error": error(agent, test)}
+        return {"update": agent.updates, "drift": drift(agent.actor.act(windows)[:, 0], reference), "error": error(agent, test)}
 
     yield row()
     for log in updates(agent, replay, count, batch=batch, seed=seed):

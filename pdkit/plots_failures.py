@@ -49,8 +49,9 @@ def directions_figure(cosines: Sequence[np.ndarray], dim: int, sizes: dict[str, 
 
 @styled
 def drift_figure(drifts: pd.DataFrame, *, bound: float, distance: float) -> Picture:
-    """Mean |a - a_0| against updates for each arm (columns arm, update, drift), the residual's bound, and how far a better policy is."""
-    figure, axes = blank(size=(7.6, 3.6))
+    """Left: mean |a - a_0| against updates for each arm (columns arm, update, drift, heading), the residual's bound, and how far a better
+    policy is. Right: whether they drift towards that one."""
+    figure, axes = blank(1, 2, (10.4, 3.6), width_ratios=[1.5, 1])
     ax = axes[0, 0]
     ax.axhline(distance, color=COLORS["recorded"], lw=1.4)
     ax.axhline(bound, color=COLORS["decorated"], ls=":", lw=1.2)
@@ -63,6 +64,12 @@ def drift_figure(drifts: pd.DataFrame, *, bound: float, distance: float) -> Pict
                 fontsize=8.5)
     ax.set(xlabel="updates of the actor", ylabel="mean |a - a0| per dimension", xlim=(0, right * 1.02), ylim=(0, None))
     ax.set_title("How far the policy has drifted")
+    other = axes[0, 1]
+    other.axhline(0, color="black", lw=0.8)
+    for name, rows in drifts[drifts["update"] > 0].groupby("arm", sort=False):
+        other.plot(rows["update"], rows.heading, "-o", ms=3.5, color=ARMS.get(name, OTHERS[0]))
+    other.set(xlabel="updates of the actor", ylabel="cosine; 1: straight to the better policy", xlim=(0, right * 1.02), ylim=(-0.6, 0.6))
+    other.set_title("Where to")
     figure.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=5, fontsize=9)
     return figure
 

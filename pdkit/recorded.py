@@ -95,14 +95,16 @@ def record_of(name: str, task: str) -> str:
 
 
 def by_arm(table: pd.DataFrame, group: str, field: str, name: str) -> pd.DataFrame:
-    """A notebook's recorded rows, whose columns are called GROUP.ARM.FIELD, as one row an arm and seed: recipe (the arm), seed, `name`.
+    """A notebook's recorded rows, whose columns are called GROUP.ARM.FIELD (GROUP.ARM for an empty field), as one row an arm and seed:
+    recipe (the arm), seed, `name`.
 
     Raises PdkitError when there is no such column.
     """
-    arms = {column: column.removeprefix(f"{group}.").removesuffix(f".{field}") for column in table
-            if column.startswith(f"{group}.") and column.endswith(f".{field}")}
+    end = f".{field}" if field else ""
+    arms = {column: column.removeprefix(f"{group}.").removesuffix(end) for column in table
+            if column.startswith(f"{group}.") and column.endswith(end)}
     if not arms:
-        raise PdkitError(f"These results have no columns {group}.ARM.{field}; they come from another notebook.")
+        raise PdkitError(f"These results have no columns {group}.ARM{end}; they come from another notebook.")
     rows = table.set_index("seed")[list(arms)].rename(columns=arms).stack()
     return rows.rename_axis(["seed", "recipe"]).rename(name).reset_index()[["recipe", "seed", name]]
 

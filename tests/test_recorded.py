@@ -39,6 +39,8 @@ def test_a_notebooks_columns_become_rows_by_arm():
                                        {"recipe": "before", "seed": 1, "success": 0.8}]
     with pytest.raises(PdkitError, match="no columns drift.ARM.value"):
         recorded.by_arm(table, "drift", "value", "drift")
+    rows = recorded.by_arm(pd.DataFrame({"seed": [1], "heading.critic": [0.5], "cosine": [0.1]}), "heading", "", "at")
+    assert rows.to_dict("records") == [{"recipe": "critic", "seed": 1, "at": 0.5}]
 
 
 def test_a_notebooks_numbered_columns_become_rows():
