@@ -309,11 +309,20 @@ def finding(record: str | Sequence[str], values: pd.Series, measured: str, inter
     tasks = list(dict.fromkeys(values.index.get_level_values("task")))
     if verdict == "reproduced" and not set(paper) <= set(tasks):
         verdict = "partly"
-    seeds = " ".join(str(seed) for seed in sorted(set(values.index.get_level_values("seed"))))
+    seeds = _listed(values.index)
+    own = {task: _listed(mine.index) for task, mine in values.groupby(level="task")}
+    if len(set(own.values())) > 1:
+        told = {mine: " ".join(task for task in tasks if own[task] == mine) for mine in sorted(set(own.values()), reverse=True)}
+        measured += "; seeds " + ", ".join(f"{mine} on {where}" for mine, where in told.items())
     records = [part for name in ([record] if isinstance(record, str) else record) for part, (table, _) in _records(name).items()
                if set(table.task) & set(tasks)]
     made = [command for part in records for command in commands(part, tasks, recipes)]
     return Finding(" ".join(tasks), seeds, measured, interval, verdict, "; ".join(dict.fromkeys(made)))
+
+
+def _listed(index: pd.MultiIndex) -> str:
+    """The seeds of an index of tasks and seeds, in order."""
+    return " ".join(str(seed) for seed in sorted(set(index.get_level_values("seed"))))
 
 
 def commands(record: str, tasks: Sequence[str], recipes: Collection[str] = ()) -> list[str]:

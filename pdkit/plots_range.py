@@ -12,13 +12,14 @@ from .plots import COLORS, Picture, _columns, blank, styled
 @styled
 def range_figure(tasks: pd.DataFrame, averages: pd.DataFrame, title: str = "") -> Picture:
     """Rows of `task_range.by_task`, an arrow from base to decorated success with intervals; below the tasks of a suite the mean, and
-    the paper's as open marks."""
+    the paper's as open marks. Where `averages` has no row a suite, one group of all tasks."""
     _columns(tasks, "task", "suite", "base", "decorated", "low", "high", "seeds")
     lines, y = [], 0.0
-    for suite, rows in tasks.groupby("suite", sort=False):
+    groups = tasks.suite if tasks.suite.isin(averages.over).all() else tasks.suite.map(lambda _: "all")
+    for group, rows in tasks.groupby(groups, sort=False):
         lines += [(y + i, row) for i, row in enumerate(rows.itertuples())]
         y += len(rows)
-        lines.append((y, averages[averages.over == suite].iloc[0]))
+        lines.append((y, averages[averages.over == group].iloc[0]))
         y += 1.6
     figure, axes = blank(size=(8.2, 0.9 + 0.34 * y))
     ax, labels = axes[0, 0], {}
@@ -43,7 +44,7 @@ def range_figure(tasks: pd.DataFrame, averages: pd.DataFrame, title: str = "") -
     ax.xaxis.set_major_formatter(mpl.ticker.PercentFormatter(1.0, decimals=0))
     ax.grid(axis="y", visible=False)
     marks = [("o", COLORS["base"], COLORS["base"], "base policy"), ("o", COLORS["decorated"], COLORS["decorated"], "decorated"),
-             ("s", "none", "0.3", "the paper's mean, four tasks")]
+             ("s", "none", "0.3", "the paper's mean")]
     handles = [Line2D([], [], marker=m, ls="", mfc=fill, color=edge, label=label) for m, fill, edge, label in marks]
     figure.legend(handles=handles, loc="outside lower center", ncols=3, fontsize=8.5)
     return figure

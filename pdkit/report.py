@@ -9,7 +9,7 @@ data/results/claims.csv has a row a claim:
                                                  command   that makes the numbers again
 
 `pdkit report --update` first computes every verdict anew for which there is a rule (pdkit/verdicts) and enough is recorded, and draws
-all_tasks.png.
+all_tasks.png and over_diffusion.png.
 A claim whose verdict is not "untested" has all of them. The recorded tables beside it (a row a run, with its command) are checked
 too: a report on broken tables is refused.
 """
@@ -166,6 +166,11 @@ def main(argv: list[str]) -> int:
     if args.update and "main_job" in tables:
         with atomic_file(folder / "all_tasks.png") as temporary:
             save_small(_range(tables), temporary)
+    sampled = task_range.over_diffusion()
+    if args.update and len(sampled):
+        with atomic_file(folder / "over_diffusion.png") as temporary:
+            means = task_range.averages(sampled, {"all": task_range.PAPER_DIFFUSION})
+            save_small(plots_range.range_figure(sampled, means, "Over a Diffusion Policy, the last policy of a run"), temporary)
     problems = claim_problems(claims)
     for name, table in tables.items():
         problems += table_problems(name, table, folder)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import re
+from collections.abc import Mapping
 
 import pandas as pd
 
@@ -116,11 +117,11 @@ def _results(rows: pd.DataFrame) -> dict[str, object]:
             "high": min(interval.high, 1.0), "at_end": rows.decorated_success_at_end.mean()}
 
 
-def averages(tasks: pd.DataFrame) -> pd.DataFrame:
-    """Means over the tasks of `by_task` that are recorded, beside the paper's: a row for "all" and each suite: over, tasks (how many of how
-    many), base, decorated, at_end, paper_base, paper_decorated; all shares from 0 to 1."""
+def averages(tasks: pd.DataFrame, paper: Mapping[str, tuple[float, float]] = PAPER) -> pd.DataFrame:
+    """Means over the tasks of `by_task` that are recorded, beside the paper's: a row for each name in `paper` ("all" tasks, or a suite):
+    over, tasks (how many of how many), base, decorated, at_end, paper_base, paper_decorated; all shares from 0 to 1."""
     rows = []
-    for over, (base, decorated) in PAPER.items():
+    for over, (base, decorated) in paper.items():
         mine = tasks if over == "all" else tasks[tasks.suite == over]
         known = mine.dropna(subset=["decorated"])
         rows.append({"over": over, "tasks": f"{len(known)} of {len(mine)}", "base": known.base.mean(), "decorated": known.decorated.mean(),

@@ -107,8 +107,8 @@ def test_damaged_human_demonstrations_are_said_with_what_to_do(monkeypatch, tmp_
 
 
 def test_human_demonstrations_are_clipped_and_judged(monkeypatch, tmp_path):
-    """A data set as Minari gives it: raw actions beyond 1, no success recorded, the hinge at index 28. Where only a reward is recorded it
-    decides nothing: Pen's bonus is given within 0.9, the task asks for 0.95."""
+    """A data set as Minari gives it: raw actions beyond 1, no success recorded, the hinge at index 28. Where observations do not tell, a
+    reward decides nothing."""
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
     monkeypatch.setattr(minari, "download_dataset", lambda name: None)
 
@@ -130,9 +130,17 @@ def test_human_demonstrations_are_clipped_and_judged(monkeypatch, tmp_path):
     assert demos.success.tolist() == [False, False, True, True]
     Recorded.rewards = np.full(4, 20.0)
     with pytest.raises(PdkitError, match="do not say at which steps they were solved"):
-        sources.human("Pen")
+        sources.human("Hammer")
     Recorded.infos = {"success": np.array([False, False, False, True, True])}  # of the reset, then of each step
-    assert sources._recorded_success("Pen", Recorded).tolist() == [False, False, True, True]
+    assert sources._recorded_success("Hammer", Recorded).tolist() == [False, False, True, True]
+
+
+@pytest.mark.parametrize("task", ["Door", "Pen", "Relocate"])
+def test_observations_tell_success_as_the_simulator_does(task):
+    demos = load_demos(DATA / "demos" / f"{task}.safetensors")
+    for e in demos.episodes():
+        told = sources._recorded_success(task, SimpleNamespace(infos={}, actions=e["actions"], observations=e["observations"]))
+        assert np.array_equal(told, e["success"])
 
 
 def test_agent_episodes_are_what_the_simulator_did(monkeypatch):

@@ -20,6 +20,10 @@ from .experts import scripted_episodes
 from .format import Demos, from_episodes, load_demos
 
 MINARI = {"Door": "D4RL/door/human-v2", "Pen": "D4RL/pen/human-v2", "Hammer": "D4RL/hammer/human-v2", "Relocate": "D4RL/relocate/human-v2"}
+JUDGED: dict[str, Callable[[np.ndarray], np.ndarray]] = {  # the rules of the tasks, on observations (M, obs_dim): solved or not, (M,)
+    "Door": lambda o: o[:, 28] >= 1.35,  # the hinge
+    "Pen": lambda o: (np.linalg.norm(o[:, 39:42], axis=1) < 0.075) & ((o[:, 33:36] * o[:, 36:39]).sum(axis=1) > 0.95),
+    "Relocate": lambda o: np.linalg.norm(o[:, 36:39], axis=1) < 0.1}
 
 
 def bundled(task: str) -> Demos:
@@ -171,13 +175,13 @@ def human(task: str) -> Demos:
 
 
 def _recorded_success(task: str, episode) -> np.ndarray:
-    """Success after each step: the environment's own flag where it was recorded, else (Door) the rule on the observation. Raises PdkitError
-    where neither tells."""
+    """Success after each step: the environment's own flag where it was recorded, else the rule on the observation. Raises PdkitError where
+    neither tells."""
     length = len(episode.actions)
     infos = getattr(episode, "infos", None) or {}
     if "success" in infos:
         return np.asarray(infos["success"], bool).ravel()[-length:]
-    if task == "Door":
-        return episode.observations[1: length + 1, 28] >= 1.35  # the door's hinge
-    # The bonuses in the dense reward are given for less than the task asks for.
-    raise PdkitError(f"Minari's episodes of {task} do not say at which steps they were solved; use the bundled demonstrations.")
+    if task not in JUDGED:  # the bonuses in the dense reward are given for less than the task asks for
+        raise PdkitError(f"Minari's episodes of {task} do not say at which steps they were solved, and their observations do not tell it; "
+                         "use the bundled demonstrations.")
+    return JUDGED[task](np.asarray(episode.observations)[1: length + 1])

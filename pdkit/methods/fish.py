@@ -12,8 +12,17 @@ critics learn from 0.2 a_res and are asked about a_res; ours see 0.2 a_res each 
 the expert's own, ours VINN's. And it explores with small noise from the first episode on, where the loop here begins, as for the
 decorator, with uniform residuals (the lesson: 6,000 steps), of which VINN's successes suffer.
 
-The paper looks up by features of BeT's GPT (appendix B.5). The VINN that comes with the kit, on Door, and from which the recorded runs
-start, looks up by raw observations, where it does no worse (data/results/vinn.csv); another is given with --base.
+The paper looks up by features of BeT's GPT (appendix B.5) and gives no k; FISH's code takes one neighbour, with an exclusion buffer. The
+VINN that comes with the kit, on Door alone, looks up five neighbours by raw observations, where it does no worse (data/results/vinn.csv),
+and both profiles start from it unless --base names another (`pdkit train base Door --policy vinn --set
+representation=data/checkpoints/Door/base`). Recorded are runs from both on Door and by GPT features on StackCube. Other numbers:
+
+                              lesson, Door    StackCube       paper    FISH's code
+    steps of reward                      5            5           1              3
+    batch                              256          256       1,024            256
+    steps between updates                4          2.9           4              2
+    rate of actor, critics      6e-4, 1e-3         3e-4        1e-4           1e-4
+    weight of imitation               0.03         0.03        0.03           0.03
 """
 from __future__ import annotations
 
