@@ -403,12 +403,10 @@ def test_fish_learns_from_demonstrations_what_nearest_neighbours_miss(beside):
 
 
 def test_rot_learns_what_the_base_policy_misses(bet_sac):
-    """By reward, imitation and the end of episodes at success together; it swings, so the later half of the training is judged. A
-    reward of the wrong sign undoes it; a constant one would do here."""
+    """By reward and imitation together, episodes going on after success as in the lesson. Imitation has the larger part (with a constant
+    reward it ends at 72 instead of 83 %, without imitation at 0): FISH's test above is the one about the reward."""
     assert success(bet_sac) < 0.2
-    t = trainer("rot", bet_sac, total_steps=2000, log_every=400)
-    t.train()
-    assert np.mean([row["train_success"] for row in t.rows[-3:]]) > 0.5
+    assert success(trainer("rot", bet_sac, total_steps=3000, on_success="continue").train()) > 0.5
 
 
 @pytest.mark.parametrize("method", ["fish", "rot"])
