@@ -50,6 +50,7 @@ STARTS = {"base": "the base policy", "bet-sac": "a BeT for fine-tuning", "vinn":
           "diffusion": "a Diffusion Policy"}
 DECORATED = {"StackCube": "bet-sac"}  # by task: the policy that comparisons decorate, where it is not the main job's; a BeT
 FORMS = {"bet-sac": "the paper's", "bet-sac,arm": "arm scaled, too (ours)"}  # of a BeT for SAC, by recipe in bet_forms.csv
+TUNABLE = "bet-sac"  # the kind of policy that SAC can fine-tune
 LEAST_RATIO = 0.01  # of smoothness: recorded numbers are rounded, and a policy that stands still has none of it
 
 
@@ -97,6 +98,17 @@ def shared(table: pd.DataFrame) -> pd.DataFrame:
     table = table[table.task.isin(theirs)] if len(theirs) else table
     count = table.groupby("recipe").task.nunique()
     return table[table.recipe.isin(count.index[count == table.task.nunique()])]
+
+
+def own_starts(table: pd.DataFrame) -> pd.DataFrame:
+    """The rows of runs from the policy that each method has by itself: without METHOD,base=bet-sac, which were given fine-tuning's."""
+    return table[~table.recipe.str.endswith(f",base={TUNABLE}")]
+
+
+def one_start(table: pd.DataFrame) -> pd.DataFrame:
+    """The rows of runs that start from the policy that SAC can fine-tune, under the plain names of their recipes."""
+    rows = table[table.policy == TUNABLE]
+    return rows.assign(recipe=rows.recipe.str.removesuffix(f",base={TUNABLE}"))
 
 
 def scores(table: pd.DataFrame, recipe: str, column: str) -> np.ndarray:

@@ -56,6 +56,15 @@ def test_every_method_has_one_family_and_a_place():
         compare.titles(["jslr"])
 
 
+def test_runs_from_one_start_have_plain_names_and_stand_apart():
+    plain, tuned = runs("policy_decorator", [0.9]), runs("sac_finetune", [0.0], policy="bet-sac")
+    given = runs("policy_decorator,base=bet-sac", [0.8], policy="bet-sac")
+    table = pd.concat([plain, tuned, given], ignore_index=True)
+    assert compare.own_starts(table).recipe.tolist() == ["policy_decorator", "sac_finetune"]
+    same = compare.one_start(table)
+    assert same.recipe.tolist() == ["sac_finetune", "policy_decorator"] and same.decorated_success.tolist() == [0.0, 0.8]
+
+
 def test_scores_take_the_seeds_that_all_tasks_have():
     table = pd.concat([runs("a", [0.1, 0.2, 0.3]), runs("a", [0.5, 0.6], task="Pen").iloc[::-1], runs("b", [0.9])], ignore_index=True)
     assert compare.scores(table, "a", "decorated_success").tolist() == [[0.1, 0.5], [0.2, 0.6]]
