@@ -41,8 +41,8 @@ OTHERS = ("residual_rl", "jsrl", *FISH)  # baselines that leave it as it is
 VERDICTS = ("not", "partly", "reproduced")  # from the weakest
 NEARLY = 0.95  # success that counts as nearly all (ours; the paper's averages are 98 % and more)
 FLOOR = 0.05  # success below which two sides are not told apart
-RISES = 2.0  # times that a temperature or |Q| must be what it is without a warm start, to count as risen massively (ours, as the next)
-EXPLODES = 10.0  # times that |Q| must be what rewards alone can make, to count as exploded
+RISES = 2.0  # times that a temperature must be what it is without a warm start, to count as risen massively (ours, as the next)
+EXPLODES = 10.0  # times that the critic's loss must be what it is without one, to count as exploded
 BETS = ("bet", "bet-sac")  # kinds of policy that are a Behavior Transformer: the paper's, and its form that SAC can tune (Table 10)
 TASKS = {"adroit": ("Door", "Pen", "Hammer", "Relocate"), "maniskill": ("StackCube", "PegInsertionSide", "TurnFaucet", "PushChair")}
 

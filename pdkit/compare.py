@@ -107,7 +107,7 @@ def own_starts(table: pd.DataFrame) -> pd.DataFrame:
 
 def one_start(table: pd.DataFrame) -> pd.DataFrame:
     """The rows of runs that start from the policy that SAC can fine-tune, under the plain names of their recipes."""
-    rows = table[table.policy == TUNABLE]
+    rows = table[table.policy == TUNABLE] if "policy" in table else table  # without a column: empty, nothing is recorded
     return rows.assign(recipe=rows.recipe.str.removesuffix(f",base={TUNABLE}"))
 
 

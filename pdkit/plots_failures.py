@@ -68,7 +68,7 @@ def drift_figure(drifts: pd.DataFrame, *, bound: float, distance: float) -> Pict
     other.axhline(0, color="black", lw=0.8)
     for name, rows in drifts[drifts["update"] > 0].groupby("arm", sort=False):
         other.plot(rows["update"], rows.heading, "-o", ms=3.5, color=ARMS.get(name, OTHERS[0]))
-    other.set(xlabel="updates of the actor", ylabel="cosine; 1: straight to the better policy", xlim=(0, right * 1.02), ylim=(-0.6, 0.6))
+    other.set(xlabel="updates of the actor", ylabel="cosine; 1: straight to the better policy", xlim=(0, right * 1.02), ylim=(-1.05, 1.05))
     other.set_title("Where to")
     figure.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=5, fontsize=9)
     return figure

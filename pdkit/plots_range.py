@@ -10,9 +10,9 @@ from .plots import COLORS, Picture, _columns, blank, styled
 
 
 @styled
-def range_figure(tasks: pd.DataFrame, averages: pd.DataFrame, title: str = "") -> Picture:
+def range_figure(tasks: pd.DataFrame, averages: pd.DataFrame, title: str = "", paper: str = "four tasks") -> Picture:
     """Rows of `task_range.by_task`, an arrow from base to decorated success with intervals; below the tasks of a suite the mean, and
-    the paper's as open marks. Where `averages` has no row a suite, one group of all tasks."""
+    the paper's (over which tasks: `paper`) as open marks. Where `averages` has no row a suite, one group of all tasks."""
     _columns(tasks, "task", "suite", "base", "decorated", "low", "high", "seeds")
     lines, y = [], 0.0
     groups = tasks.suite if tasks.suite.isin(averages.over).all() else tasks.suite.map(lambda _: "all")
@@ -44,7 +44,7 @@ def range_figure(tasks: pd.DataFrame, averages: pd.DataFrame, title: str = "") -
     ax.xaxis.set_major_formatter(mpl.ticker.PercentFormatter(1.0, decimals=0))
     ax.grid(axis="y", visible=False)
     marks = [("o", COLORS["base"], COLORS["base"], "base policy"), ("o", COLORS["decorated"], COLORS["decorated"], "decorated"),
-             ("s", "none", "0.3", "the paper's mean")]
+             ("s", "none", "0.3", f"the paper's mean, {paper}")]
     handles = [Line2D([], [], marker=m, ls="", mfc=fill, color=edge, label=label) for m, fill, edge, label in marks]
     figure.legend(handles=handles, loc="outside lower center", ncols=3, fontsize=8.5)
     return figure

@@ -63,15 +63,15 @@ def by_task(table: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows).reindex(columns=COLUMNS)
 
 
-def over_diffusion() -> pd.DataFrame:
+def over_diffusion(tables: Mapping[str, pd.DataFrame] | None = None) -> pd.DataFrame:
     """The same for the tasks on which a Diffusion Policy was decorated: there it is the *last* policy that is tested, after fewer steps.
 
-    Empty where nothing is recorded.
+    `tables` are the records by name (None: those of data/results). Empty where nothing is recorded.
     """
     rows = []
     for record, cell in DIFFUSION.items():
         with contextlib.suppress(PdkitError):
-            table = load(record)[0]
+            table = load(record)[0] if tables is None else tables.get(record, pd.DataFrame(columns=["recipe"]))
             for task, mine in table[table.recipe == cell].groupby("task"):
                 suite = next(name for name in SUITES if task in TASKS[name])
                 rows.append({"task": task, "suite": suite} | _demonstrations(task) | _results(mine))

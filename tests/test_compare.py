@@ -63,6 +63,7 @@ def test_runs_from_one_start_have_plain_names_and_stand_apart():
     assert compare.own_starts(table).recipe.tolist() == ["policy_decorator", "sac_finetune"]
     same = compare.one_start(table)
     assert same.recipe.tolist() == ["sac_finetune", "policy_decorator"] and same.decorated_success.tolist() == [0.0, 0.8]
+    assert compare.one_start(pd.DataFrame(columns=["task", "recipe", "seed"])).empty  # as `available` gives it where nothing is recorded
 
 
 def test_scores_take_the_seeds_that_all_tasks_have():

@@ -331,6 +331,10 @@ def test_the_reward_of_rot_uses_a_copy_of_the_trunk_that_is_renewed_at_times(bet
         observations = torch.from_numpy(as_trained(reach_demos(3, spec=ONE), t.config)[0])
         expected = t._phi(bet_sac.normalizer(observations))[1:]
     assert np.allclose(t.reward.targets[0], expected, atol=1e-5)
+    shown = as_trained(reach_demos(3, spec=ONE), t.config)[0]
+    t.reward.scale = 1.0
+    like, unlike = (t.reward(episode).sum() for episode in (shown, shown + np.float32([0.5, -0.5, 0, 0])))
+    assert like > unlike  # to act like a demonstration pays, in the trunk's features, too
 
 
 # ---- FISH ------------------------------------------------------------------------------------------------------------

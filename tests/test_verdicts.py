@@ -771,7 +771,7 @@ def test_a_warm_start_is_judged_at_equal_ages_of_the_actor(results, late, verdic
 def test_a_warm_start_explodes_where_the_critics_loss_does_on_every_task(results, stack, others, verdict):
     claim = CLAIMS.claim[CLAIMS.claim.str.startswith("Warm-starting the critic makes")].item()
     usual = {"runs.warm.temperature": 2.8, "runs.vanilla.temperature": 1.0, "runs.warm.loss": 100.0, "runs.vanilla.loss": 5.0,
-             "runs.warm.q": 120.0, "runs.vanilla.q": 30.0, "rewards_alone": 50.0, "warmup": 1_000}
+             "runs.warm.q": 120.0, "runs.vanilla.q": 30.0, "rewards_alone": 50.0}
     for name, task, changed in (("warm_start", "Door", others), ("warm_start_stackcube", "StackCube", others | stack)):
         write(results, name, pd.DataFrame({"task": task, "recipe": "x", "seed": range(3)} | usual | changed))
     found = verdicts.find(claim)

@@ -78,7 +78,7 @@ METHODS: dict[str, Method] = {
         "from scratch with demonstrations",
         changes=_OWN_POLICY | dict(warmup="uniform", demo_fraction=0.5, critic_layer_norm=True, num_critics=10, target_subset=2,
                                    actor_value="mean", entropy_backup=False, target_entropy_scale=0.5, n_step=1),
-        # An update of ten critics costs four times one of two, so UTD 20 at full batch would take hours: 1 is a twentieth.
+        # An update of ten critics costs several times one of two, so UTD 20 at full batch would take hours: 1 is a twentieth.
         lesson=dict(utd=1.0),
         paper=dict(utd=20.0, batch=256, gamma=0.99, actor_lr=3e-4, critic_lr=3e-4, tau=0.005, warmup_steps=5_000, total_steps=1_000_000,
                    actor_every=20, on_success="continue", log_std_range=(-3.0, 2.0), xavier_init=True),  # a spread of 0.6 at first, there 1

@@ -10,7 +10,7 @@ weight are the original's; the paper gives none. So are transport's epsilon of 0
 episode's sum to -10; that the first 10 demonstrations alone are compared with is ours (`ot_...` in config.py). Rates, batches and updates
 are those in finetune.py. Unlike the original, the trunk is the critics' (the paper's words), so it starts untrained. Each critic's gradient
 is clipped as in SAC; the trunk's, which they share, is not (the original clips none). Where the original looks three steps of reward
-ahead, the lesson looks five and the paper profile one, as for all methods; and in the lesson training episodes go on after success.
+ahead, the lesson looks five and the paper profile one, as fine-tuning does; and in the lesson training episodes go on after success.
 """
 from __future__ import annotations
 

@@ -36,6 +36,7 @@ from ..claims import (
     signed,
     task_by_task,
 )
+from ..methods import METHODS
 from ..task_range import COLD, DIFFUSION
 from .registry import EIGHT, measures
 
@@ -85,8 +86,8 @@ def _() -> Finding:
 def _() -> Finding:
     """Ahead of the best of both kinds; the interval is that of the smaller lead. What was not run is told."""
     records, table, cells = _recorded()
-    absent = [method for method in (*KEPT, "jsrl") if method not in set(table.recipe)]
-    told = f"{cells}{besides(table, BESIDES)}" + f"; not run over one: {', '.join(absent)}" * bool(absent)
+    absent = [METHODS[method].title for method in (*KEPT, "jsrl") if method not in set(table.recipe)]
+    told = f"{cells}{besides(table, BESIDES)}" + f"; not run over a Diffusion Policy: {', '.join(absent)}" * bool(absent)
     return _cold(ahead(records, table, DECORATOR, {"no fine-tuning": KEPT, "fine-tuning": TUNED}, EIGHT, told))
 
 

@@ -99,8 +99,9 @@ def _() -> Finding:
         (name, one), = found.items()
         return replace(one, measured=f"{name} {one.measured}; the other suite untested", verdict=weakest(one.verdict, "partly"))
     one, two = found.values()
+    apart = f"; seeds {one.seeds}" * (one.seeds != two.seeds and "; seeds" not in one.measured)
     return replace(one, tasks=f"{one.tasks} {two.tasks}", seeds=" ".join(sorted({*one.seeds.split(), *two.seeds.split()})),
-                   measured=f"ManiSkill {one.measured}, Adroit {two.measured}", interval=f"{one.interval}; {two.interval}",
+                   measured=f"ManiSkill {one.measured}{apart}; Adroit {two.measured}", interval=f"{one.interval}; {two.interval}",
                    verdict=jointly(one.verdict, two.verdict),
                    command="; ".join(dict.fromkeys(f"{one.command}; {two.command}".split("; "))))
 

@@ -181,8 +181,8 @@ def _() -> Finding:
 def _gaps() -> str:
     """What base policies solve on objects of the demonstrations and on novel ones; nothing where that is not recorded."""
     with contextlib.suppress(TooLittle):
-        rows = recorded("objects")[0].sort_values("task")
-        told = [f"{row['task']} {percent(row['totals.base on source.value'])} and {percent(row['totals.base on novel.value'])}"
-                for _, row in rows.iterrows()]
+        rows = recorded("objects")[0].groupby("task").mean(numeric_only=True)
+        told = [f"{task} {percent(row['totals.base on source.value'])} and {percent(row['totals.base on novel.value'])}"
+                for task, row in rows.iterrows()]
         return f"; base policies on the demonstrations' objects and on novel ones: {', '.join(told)}"
     return ""
