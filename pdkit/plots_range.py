@@ -7,19 +7,20 @@ import pandas as pd
 from matplotlib.lines import Line2D
 
 from .plots import COLORS, Picture, _columns, blank, styled
+from .task_range import PAPER_DIFFUSION, averages
 
 
 @styled
-def range_figure(tasks: pd.DataFrame, averages: pd.DataFrame, title: str = "", paper: str = "four tasks") -> Picture:
+def range_figure(tasks: pd.DataFrame, means: pd.DataFrame, title: str = "", paper: str = "four tasks") -> Picture:
     """Rows of `task_range.by_task`, an arrow from base to decorated success with intervals; below the tasks of a suite the mean, and
-    the paper's (over which tasks: `paper`) as open marks. Where `averages` has no row a suite, one group of all tasks."""
+    the paper's (over which tasks: `paper`) as open marks. Where `means` has no row a suite, one group of all tasks."""
     _columns(tasks, "task", "suite", "base", "decorated", "low", "high", "seeds")
     lines, y = [], 0.0
-    groups = tasks.suite if tasks.suite.isin(averages.over).all() else tasks.suite.map(lambda _: "all")
+    groups = tasks.suite if tasks.suite.isin(means.over).all() else tasks.suite.map(lambda _: "all")
     for group, rows in tasks.groupby(groups, sort=False):
         lines += [(y + i, row) for i, row in enumerate(rows.itertuples())]
         y += len(rows)
-        lines.append((y, averages[averages.over == group].iloc[0]))
+        lines.append((y, means[means.over == group].iloc[0]))
         y += 1.6
     figure, axes = blank(size=(8.2, 0.9 + 0.34 * y))
     ax, labels = axes[0, 0], {}
@@ -48,6 +49,12 @@ def range_figure(tasks: pd.DataFrame, averages: pd.DataFrame, title: str = "", p
     handles = [Line2D([], [], marker=m, ls="", mfc=fill, color=edge, label=label) for m, fill, edge, label in marks]
     figure.legend(handles=handles, loc="outside lower center", ncols=3, fontsize=8.5)
     return figure
+
+
+def over_diffusion_figure(tasks: pd.DataFrame) -> Picture:
+    """The same of `task_range.over_diffusion`."""
+    return range_figure(tasks, averages(tasks, {"all": PAPER_DIFFUSION}), "Over a Diffusion Policy, the last policy of a run",
+                        "six tasks that it does not name")
 
 
 @styled

@@ -151,16 +151,6 @@ def _range(tables: dict[str, pd.DataFrame]) -> Picture:
     return plots_range.range_figure(tasks, task_range.averages(tasks), "Base policies and decorated ones, best evaluation of a run")
 
 
-def over_diffusion(tables: dict[str, pd.DataFrame]) -> Picture | None:
-    """The same for Diffusion Policies; None where nothing is recorded."""
-    mine = {name: of_these_objects(tables[name]) for name in task_range.DIFFUSION if name in tables}
-    sampled = task_range.over_diffusion(mine)
-    if not len(sampled):
-        return None
-    means = task_range.averages(sampled, {"all": task_range.PAPER_DIFFUSION})
-    return plots_range.range_figure(sampled, means, "Over a Diffusion Policy, the last policy of a run", "six tasks that it does not name")
-
-
 def main(argv: list[str]) -> int:
     """`pdkit report [--update] [--out FILE]`; 1 when something in the claims or the tables is wrong, which is then listed."""
     parser = Parser(prog="pdkit report", description="List the paper's claims with what was measured, and write a page.")
@@ -182,9 +172,11 @@ def main(argv: list[str]) -> int:
     if problems:
         print(*problems, sep="\n", file=sys.stderr)
         return 1
-    if args.update and (picture := over_diffusion(tables)):
-        with atomic_file(folder / "over_diffusion.png") as temporary:
-            save_small(picture, temporary)
+    if args.update:
+        sampled = task_range.over_diffusion({name: of_these_objects(tables[name]) for name in task_range.DIFFUSION if name in tables})
+        if len(sampled):
+            with atomic_file(folder / "over_diffusion.png") as temporary:
+                save_small(plots_range.over_diffusion_figure(sampled), temporary)
     out = page.write_page(args.out or runs_root() / "report.html", "Claims of the paper, and what was measured",
                           sections(claims, tables, folder))
     print(*lines(claims), "", sep="\n")

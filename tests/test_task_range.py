@@ -69,8 +69,9 @@ def test_what_is_recorded_over_a_diffusion_policy(results):
     drawn.to_csv(results / "diffusion_finetuning.csv", index=False)
     (two,) = task_range.over_diffusion().to_dict("records")
     assert two["base"] == pytest.approx(0.65) and two["base_high"] - two["base_low"] < row["base_high"] - row["base_low"]
-    means = task_range.averages(pd.DataFrame([two]), {"all": task_range.PAPER_DIFFUSION})
-    (ax,) = plots_range.range_figure(pd.DataFrame([two]), means).axes
+    figure = plots_range.over_diffusion_figure(pd.DataFrame([two]))
+    (ax,) = figure.axes
+    assert figure.legends[0].get_texts()[-1].get_text() == "the paper's mean, six tasks that it does not name"
     assert [label.get_text() for label in ax.get_yticklabels()] == ["StackCube (2 seeds)", "mean, 1 of 1 tasks"]
     assert [float(np.ravel(line.get_xdata())[0]) for line in ax.lines if line.get_marker() == "s"] == pytest.approx([0.5255, 0.999])
 
