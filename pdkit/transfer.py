@@ -119,7 +119,7 @@ def refuse_to_replace(name: str, tasks: Sequence[str], recipes: Sequence[str], f
         holder = words[2] if words[:2] == ["pdkit", "evaluate"] else row.command
         if Path(holder).resolve() != Path(folder).resolve():
             raise PdkitError(f"data/results/{name}.csv holds {row.task}'s {row.recipe!r} of {holder}, which recording {folder} would "
-                             "replace; choose another name for --record, or take that row out first.")
+                             "replace; choose another name for --record (without --oracle: or --recipe), or take that row out first.")
 
 
 def corrected(kind: str, policy: Policy | Decorated | JumpStart, args: argparse.Namespace) -> int:
@@ -149,6 +149,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--tasks", nargs="+", required=True, help="for example TurnFaucetSource TurnFaucet")
     parser.add_argument("--episodes", type=int, default=100, help="test episodes of each task (default 100)")
     parser.add_argument("--record", help="name under data/results: a row a task is added to NAME.csv")
+    parser.add_argument("--recipe", help="what --record calls the policy (default: base, decorated or jsrl, with its --sampling)")
     parser.add_argument("--film", metavar="FILE", help="write an episode as FILE (.mp4 or .webp) instead, of a decorated policy or "
                                                        "JSRL's one that its base does not solve, side by side")
     parser.add_argument("--oracle", nargs="+", type=float, metavar="ALPHA", help="success of a base policy that a demonstrator corrects by "
@@ -163,7 +164,9 @@ def main(argv: list[str]) -> int:
         raise PdkitError("--oracle corrects a base policy as it was made; leave --sampling out.")
     if args.episodes < 1:
         raise PdkitError(f"--episodes must be at least 1, not {args.episodes}.")
-    check_names(args.record)
+    if args.recipe and (args.film or args.oracle or not args.record):
+        raise PdkitError("--recipe names the rows that --record adds of a policy as it is: add --record, leave --film and --oracle out.")
+    check_names(args.record, args.recipe)
     set_threads(args.threads)
     kind, policy = load_any(args.policy)
     policy = sampled(policy, settings := parse_settings(args.sampling, "--sampling"))
@@ -174,7 +177,7 @@ def main(argv: list[str]) -> int:
         return 0
     if args.oracle:
         return corrected(kind, policy, args)
-    recipe = ",".join([kind, *(f"{name}={type(DiffusionPolicy.defaults[name])(value)}" for name, value in settings.items())])
+    recipe = args.recipe or ",".join([kind, *(f"{name}={type(DiffusionPolicy.defaults[name])(value)}" for name, value in settings.items())])
     if args.record:
         refuse_to_replace(args.record, args.tasks, [recipe], args.policy)
     rows = transfer(policy, args.tasks, args.episodes, encoder_of(args.policy))
@@ -182,7 +185,8 @@ def main(argv: list[str]) -> int:
         print(f"{row.task}: {wilson(round(row.success * row.episodes), row.episodes)}; at the last step {row.success_at_end:.1%}")
     if args.record:
         asked = ["--sampling", *args.sampling] if args.sampling else []
+        called = ["--recipe", args.recipe] if args.recipe else []
         command = shlex.join(["pdkit", "evaluate", args.policy, "--tasks", *args.tasks, "--episodes", str(args.episodes), *asked,
-                              "--record", args.record])
+                              "--record", args.record, *called])
         recorded.record(args.record, rows.assign(recipe=recipe, seed=0, command=command, commit=commit()), pd.DataFrame())
     return 0

@@ -1,5 +1,6 @@
 """`pdkit evaluate`: a saved policy on the test episodes of several tasks, and the recorded gap between source and novel objects."""
 import dataclasses
+import shlex
 import types
 
 import mediapy
@@ -96,6 +97,12 @@ def test_another_policys_row_is_not_replaced(tmp_path, monkeypatch, capsys):
         told = capsys.readouterr()
         assert f"holds reach's '{row}' of {tmp_path / 'the one'}" in told.err and "another name" in told.err and "reach:" not in told.out
         assert (tmp_path / "data" / "results" / "r.csv").read_bytes() == table
+    named = ["evaluate", "two", "--tasks", "reach", "--episodes", "2", "--record", "r", "--recipe", "the other"]
+    assert cli.main(named) == 0
+    rows = pd.read_csv(tmp_path / "data" / "results" / "r.csv").set_index("recipe")
+    assert set(rows.index) == {"base", "mlp,alpha=0", "the other"} and rows.command["the other"] == shlex.join(["pdkit", *named])
+    capsys.readouterr()
+    assert cli.main([*named[:2], *named[2:6], "--recipe", "x"]) == 2 and "add --record" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("words", "message"), [
