@@ -14,6 +14,7 @@ from .errors import PdkitError, unknown
 from .files import ROOT, read_json, runs_root, write_json
 
 NOTEBOOKS = ROOT / "notebooks"
+MINE = "mine"  # the folder below it for a reader's own copies; git leaves it alone
 RESULT = "result.json"  # its presence alone says that a notebook came to its end
 PROGRESS_FILE = "PDKIT_PROGRESS"  # environment variable: where a kernel leaves its progress line for the runner
 
@@ -21,9 +22,12 @@ PROGRESS_FILE = "PDKIT_PROGRESS"  # environment variable: where a kernel leaves 
 # ---- what a notebook calls -------------------------------------------------------------------------------------------
 
 def folder(out: str | Path = "", name: str = "") -> Path:
-    """The folder for a notebook's files: the parameter `out`, or runs/nb/NAME/lab when that is empty; it is made."""
+    """The folder for a notebook's files: the parameter `out`, or runs/nb/NAME/lab when that is empty; it is made.
+
+    A relative `out` is one in the kit's folder: a kernel runs in notebooks/, where results have no business.
+    """
     name = name or Path(os.environ.get("JPY_SESSION_NAME", "unnamed")).stem  # set by JupyterLab for its kernels
-    path = Path(out) if str(out) else runs_root() / "nb" / name / "lab"
+    path = ROOT / out if str(out) else runs_root() / "nb" / name / "lab"
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -97,13 +101,22 @@ class Line:
 # ---- finding and running one -----------------------------------------------------------------------------------------
 
 def notebooks() -> dict[str, Path]:
-    """Every notebook by its name, the path below notebooks/ without .ipynb."""
-    paths = sorted(p for p in NOTEBOOKS.rglob("*.ipynb") if ".ipynb_checkpoints" not in p.parts)
-    return {path.relative_to(NOTEBOOKS).with_suffix("").as_posix(): path for path in paths}
+    """Every notebook of the kit by its name, the path below notebooks/ without .ipynb: without a reader's own, those in notebooks/mine and
+    JupyterLab's duplicates."""
+    found = {name_of(path): path for path in sorted(NOTEBOOKS.rglob("*.ipynb"))}
+    return {name: path for name, path in found.items()
+            if not {".ipynb_checkpoints", MINE} & set(Path(name).parts) and "-Copy" not in path.stem}
+
+
+def name_of(path: Path) -> str:
+    """What the notebook at `path` is called: its path below notebooks/ without .ipynb, or for one elsewhere the whole path."""
+    return path.relative_to(NOTEBOOKS).with_suffix("").as_posix() if path.is_relative_to(NOTEBOOKS) else str(path)
 
 
 def find_notebook(name: str) -> Path:
-    """The notebook called `name`, or the only one whose name starts so (`05`). Raises PdkitError."""
+    """The notebook called `name`, the only one whose name starts so (`05`), or the one in the file `name` (.ipynb). Raises PdkitError."""
+    if str(name).endswith(".ipynb") and Path(name).is_file():
+        return Path(name).resolve()
     known = notebooks()
     name = str(name).removeprefix("notebooks/").removesuffix(".ipynb")
     if name in known:
@@ -162,7 +175,7 @@ def main(argv: list[str]) -> int:
     from .nb_cells import PROFILES
 
     parser = Parser(prog="pdkit nb", description="Run a notebook without a browser, with other parameters.")
-    parser.add_argument("name", nargs="?", help="name of a notebook in notebooks/, or its beginning (05)")
+    parser.add_argument("name", nargs="?", help="name of a notebook in notebooks/, its beginning (05), or a file (.ipynb)")
     parser.add_argument("-p", dest="parameters", metavar="NAME=VALUE", action="append", default=[],
                         help="set a parameter of the notebook; may be repeated")
     parser.add_argument("--profile", help=f"short for -p profile=...: {', '.join(PROFILES)}")
@@ -177,7 +190,7 @@ def main(argv: list[str]) -> int:
         raise PdkitError(f"--timeout must be more than 0 seconds, not {args.timeout:g}.")
     path = find_notebook(args.name)
     values = checked_parameters(args.name, _typed(path, args))
-    out = Path(args.out).resolve() if args.out else default_folder(path.stem, values)
+    out = Path(args.out).resolve() if args.out else default_folder(name_of(path), values)
     print(f"Running {path.name}; results go to {out}", flush=True)
     result = run_notebook(args.name, values, out, args.timeout)
     print(json.dumps(result, indent=1))
@@ -185,7 +198,12 @@ def main(argv: list[str]) -> int:
 
 
 def default_folder(name: str, values: dict[str, Any]) -> Path:
-    """runs/nb/NAME/PROFILE, with a short hash of the other values if any: the same values find their folder again."""
+    """runs/nb/NAME/PROFILE, with a short hash of the other values if any: the same values find their folder again.
+
+    NAME is a notebook's (`name_of`); of one elsewhere it is the file's, with a short hash of its folder, as two may hold the same.
+    """
+    if Path(name).is_absolute():
+        name = f"{Path(name).stem}-{hashlib.sha256(name.encode()).hexdigest()[:8]}"
     others = {key: value for key, value in sorted(values.items()) if key != "profile"}
     mark = "-" + hashlib.sha256(json.dumps(others).encode()).hexdigest()[:8] if others else ""
     return runs_root() / "nb" / name / (values.get("profile", "lesson") + mark)

@@ -195,11 +195,12 @@ def _notebook(spec: Spec, cell: dict[str, Any], seed: int) -> Job:
     name = cell.pop("notebook", None)
     if not isinstance(name, str):
         raise PdkitError(f"{spec.path.name}: a notebook sweep needs notebook = \"05\" (or another one) in fixed.")
-    stem, recipe = nb.find_notebook(name).stem, cell.pop("recipe")
+    path, recipe = nb.find_notebook(name), cell.pop("recipe")
+    name, stem = nb.name_of(path), path.stem
     values = nb.checked_parameters(name, cell | {"seed": seed})
-    words = ["nb", stem, *(word for k, v in values.items() for word in ("-p", f"{k}={json.dumps(v)}"))]
+    words = ["nb", name, *(word for k, v in values.items() for word in ("-p", f"{k}={json.dumps(v)}"))]
     labels = {"task": str(values.get("task", stem)), "recipe": recipe, "seed": seed}
-    return _job(spec, {"notebook": stem, "recipe": recipe} | values, labels, words, like=stem, minutes=spec.minutes)
+    return _job(spec, {"notebook": name, "recipe": recipe} | values, labels, words, like=name, minutes=spec.minutes)
 
 
 def _job(spec: Spec, parameters: dict[str, Any], labels: dict[str, Any], words: list[str], **others: Any) -> Job:

@@ -76,6 +76,36 @@ def test_runs_with_given_values_in_this_interpreter_and_the_notebooks_folder(fol
     assert "01_first  cell 3/3" in capsys.readouterr().out
 
 
+def test_a_file_elsewhere_runs_and_two_of_one_name_have_folders_of_their_own(folder, tmp_path, capsys, monkeypatch):
+    """Submissions: as many notebooks of one name as there are students, none of which is taken for the kit's own."""
+    monkeypatch.setenv("PDKIT_RUNS", str(tmp_path / "runs"))
+    write(folder / "01_first.ipynb", "raise ValueError", FINISH, parameters=SIMPLE)
+    where = {}
+    for student, steps in (("alice", 1), ("bob", 2)):
+        path = write(tmp_path / student / "01_first.ipynb", f"steps = {steps}", FINISH, parameters=SIMPLE)
+        assert main(["nb", str(path), "--profile", "smoke"]) == 0
+        out = capsys.readouterr().out
+        where[student] = Path(out.split("results go to ")[1].splitlines()[0])
+        assert json.loads((where[student] / "result.json").read_text())["steps"] == steps
+    assert where["alice"] != where["bob"] and {path.parent for path in where.values()} != {tmp_path / "runs" / "nb" / "01_first"}
+    assert main(["nb", str(tmp_path / "carol" / "01_first.ipynb")]) == 2 and "carol" in capsys.readouterr().err
+
+
+def test_a_readers_own_copies_are_not_the_kits_notebooks(folder):
+    """Neither JupyterLab's duplicates nor what lies in notebooks/mine makes `05` ambiguous, or is held to the kit's conventions."""
+    for name in ("05_a", "05_a-Copy1", "mine/05_a", ".ipynb_checkpoints/05_a-checkpoint"):
+        write(folder / f"{name}.ipynb", FINISH, parameters=SIMPLE)
+    assert list(nb.notebooks()) == ["05_a"] and nb.find_notebook("05") == folder / "05_a.ipynb"
+    own = nb.find_notebook(str(folder / "mine" / "05_a.ipynb"))
+    assert nb.name_of(own) == "mine/05_a" and nb.default_folder("mine/05_a", {}) != nb.default_folder("05_a", {})
+
+
+def test_a_relative_folder_is_one_of_the_kits(tmp_path, monkeypatch):
+    monkeypatch.setattr(nb, "ROOT", tmp_path / "kit")
+    monkeypatch.chdir(tmp_path)
+    assert nb.folder("runs/x") == tmp_path / "kit" / "runs" / "x" and nb.folder(tmp_path / "y") == tmp_path / "y"
+
+
 def test_a_failing_cell_is_one_sentence_and_leaves_no_old_result(folder, tmp_path):
     write(folder / "01_first.ipynb", "raise ValueError('boom\\nand more')", FINISH, parameters=SIMPLE)
     (tmp_path / "result.json").write_text('{"old": 1}')

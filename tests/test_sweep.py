@@ -495,8 +495,14 @@ def test_a_notebook_is_run_with_each_value_and_its_result_becomes_a_row(tmp_path
         mended.touch()
         assert cli.main(["sweep", str(spec), "--record", "book", "--workers", "1"]) == 0
         assert "3 jobs, 2 finished, 1 to do" in capsys.readouterr().out
+        elsewhere = tmp_path / "submitted" / "05_policy_decorator.ipynb"  # not the kit's own of that name
+        elsewhere.parent.mkdir()
+        path.rename(elsewhere)
+        spec = written(tmp_path, **BOOK | {"fixed": {"notebook": str(elsewhere)}, "grid": None, "seeds": [4]})
+        given, = sweep_jobs.make_jobs(load_spec(spec))
+        assert given.words[:2] == ("nb", str(elsewhere)) and given.labels["task"] == "05_policy_decorator"
     finally:
-        path.unlink()
+        path.unlink(missing_ok=True)
     table = pd.read_csv(results / "book.csv", dtype=str)
     assert list(table.seen) == ["a ba b", "brokenbroken", "11"] and set(table["part.total"]) == {"9"} and set(table.seed) == {"4"}
     assert "all" not in table and not (results / "book_curves.csv").exists() and nb.notebooks().get(name) is None
