@@ -299,7 +299,7 @@ def ahead(record: str | Sequence[str], table: pd.DataFrame, own: str, kinds: Map
     told = [text + (task_by_task(values, signed) or (f" ({values.index[0][0]})" if several else "")) for _, values, text in leads]
     level, least = average(mine.loc[every.index.unique()]), min((interval for interval, _, _ in leads), key=lambda lead: lead.value)
     return finding(record, every, f"{percent(level)}: {', '.join(told)}{beside}", points(least),
-                   weakest(*(judged_over_tasks(values) for _, values, _ in leads)), paper)
+                   weakest(*(_on_all(judged_over_tasks(values), values, paper) for _, values, _ in leads)), paper)
 
 
 def finding(record: str | Sequence[str], values: pd.Series, measured: str, interval: str, verdict: str, paper: Sequence[str] = (), *,
@@ -307,8 +307,7 @@ def finding(record: str | Sequence[str], values: pd.Series, measured: str, inter
     """A finding from values by (task, seed), of one record or several; "reproduced" counts as partly where tasks of the claim are
     missing. `recipes` are those that were looked at, where not all of the records are: their commands alone are given."""
     tasks = list(dict.fromkeys(values.index.get_level_values("task")))
-    if verdict == "reproduced" and not set(paper) <= set(tasks):
-        verdict = "partly"
+    verdict = _on_all(verdict, values, paper)
     seeds = _listed(values.index)
     own = {task: _listed(mine.index) for task, mine in values.groupby(level="task")}
     if len(set(own.values())) > 1:
@@ -318,6 +317,11 @@ def finding(record: str | Sequence[str], values: pd.Series, measured: str, inter
                if set(table.task) & set(tasks)]
     made = [command for part in records for command in commands(part, tasks, recipes)]
     return Finding(" ".join(tasks), seeds, measured, interval, verdict, "; ".join(dict.fromkeys(made)))
+
+
+def _on_all(verdict: str, values: pd.Series, paper: Sequence[str]) -> str:
+    """The verdict on values by (task, seed): at most "partly" where one of the claim's tasks is missing."""
+    return "partly" if verdict == "reproduced" and not set(paper) <= set(values.index.get_level_values("task")) else verdict
 
 
 def _listed(index: pd.MultiIndex) -> str:

@@ -20,6 +20,14 @@ DATA = ROOT / "data"
 TEMPORARY = ".tmp-"  # in the name of what is just being written
 
 
+def code_checksum() -> str:
+    """Of the kit's own code as it lies here: another one after any edit, committed or not."""
+    every = hashlib.sha256()
+    for path in sorted(Path(__file__).resolve().parent.rglob("*.py")):
+        every.update(path.read_bytes())
+    return every.hexdigest()
+
+
 def runs_root() -> Path:
     """Where results go: runs/ in the project, or the folder that PDKIT_RUNS names."""
     return Path(os.environ.get("PDKIT_RUNS") or ROOT / "runs").expanduser().resolve()

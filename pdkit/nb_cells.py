@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import ast
+import hashlib
 import io
 import json
 import tokenize
@@ -46,6 +47,18 @@ def read_notebook(path: Path) -> nbformat.NotebookNode:
 def code_cells(notebook: nbformat.NotebookNode) -> list[nbformat.NotebookNode]:
     """The code cells, in order."""
     return [cell for cell in notebook.cells if cell.cell_type == "code"]
+
+
+def code_checksum(path: Path) -> str:
+    """Of what a notebook's code cells do, without comments and blanks, and without the parameters cell, whose values are told apart."""
+    def meant(source: str) -> str:
+        try:
+            return ast.dump(ast.parse(source))
+        except SyntaxError:  # a foreign one with magics
+            return source
+
+    cells = [meant(cell.source) for cell in code_cells(read_notebook(path)) if not is_parameters(cell)]
+    return hashlib.sha256("\n".join(cells).encode()).hexdigest()
 
 
 def is_parameters(cell: nbformat.NotebookNode) -> bool:

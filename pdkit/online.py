@@ -34,7 +34,7 @@ from .tasks.features import Sight
 from .tasks.horizon import horizon_spec, shortened
 from .tasks.spec import TaskSpec
 from .tasks.vector import Episode, VectorEnv
-from .torch_setup import pick_device
+from .torch_setup import has_bf16, pick_device
 
 
 class Trainer:
@@ -88,6 +88,11 @@ class Trainer:
     def stored_dim(self) -> int:
         """Width of what `_view` gives."""
         return self.spec.obs_dim
+
+    @property
+    def in_bf16(self) -> bool:
+        """Whether its gradient steps are computed in bfloat16 here."""
+        return "bf16" not in self.unread and self.config.sac.bf16 and has_bf16(self.config.device)
 
     @property
     def act_dim(self) -> int:

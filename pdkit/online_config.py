@@ -45,7 +45,7 @@ class OnlineConfig:
     eval_every: int = 7_500
     eval_episodes: int = 50  # on selection seeds
     eval_workers: int = 1  # 1: evaluations run in a process of their own while this one learns; results do not depend on it
-    select: str = "best"  # the result: the last policy, or the best evaluated since gate and learning began (see Trainer._collect)
+    select: str = "best"  # the result: the last policy, or the best evaluated since the gate was fully open (see Trainer._collect)
     log_every: int = 2_500
     checkpoint_every: int = 15_000
     device: str = "cpu"  # where updates are made

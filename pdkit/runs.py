@@ -57,6 +57,16 @@ def origin(base_card: dict[str, Any], demos: Any | None, encoder: Any | None = N
     return found | ({"encoder": encoder.checksum} if encoder else {}) | ({"objects": objects} if objects else {})
 
 
+def machines(manifest: dict[str, Any]) -> list[dict[str, Any]]:
+    """Where and with which code a run was computed, as `describe_machine` tells it: a first entry, and one for each change on resuming."""
+    return [manifest["machine"], *(one["machine"] for one in manifest.get("resumed", ()))]
+
+
+def commits(manifest: dict[str, Any]) -> str:
+    """The commit of a run, or all of those that had a part in it, in order."""
+    return " then ".join(dict.fromkeys(machine["git"] for machine in machines(manifest)))
+
+
 class Run:
     """One run folder. Opening an existing one with the same parameters resumes it; with other parameters is an error."""
 
@@ -67,6 +77,9 @@ class Run:
         if self.manifest_path.exists():
             self.manifest = read_json(self.manifest_path)
             self._must_match(kind, parameters)
+            if not self.finished and (machine := describe_machine()) != self._machines()[-1]:
+                self.manifest.setdefault("resumed", []).append({"at": _now(), "machine": machine})
+                self._write_manifest()
         else:
             self.manifest = {"kind": kind, "parameters": parameters, "started": _now(), "finished": None, "machine": describe_machine()}
             self._write_manifest()
@@ -80,6 +93,9 @@ class Run:
         if self.manifest.get("kind") != kind or differing:
             raise PdkitError(f"{self.folder} holds another run (differing: {', '.join(differing) or 'kind'}); choose another folder or "
                              "delete this one.")
+
+    def _machines(self) -> list[dict[str, Any]]:
+        return machines(self.manifest)
 
     def _write_manifest(self) -> None:
         write_json(self.manifest_path, self.manifest)

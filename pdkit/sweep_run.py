@@ -46,7 +46,7 @@ class Job:
     words: tuple[str, ...]  # arguments of pdkit, without --out
     folder: Path  # its name holds a hash of the parameters
     parameters: dict[str, Any]
-    config: dict[str, Any] = field(default_factory=dict)  # everything that these parameters amount to today (not of a notebook)
+    config: dict[str, Any] = field(default_factory=dict)  # everything that these parameters amount to today (of a notebook: its code)
     like: str = ""  # jobs that are alike take alike long: a method, a notebook
     minutes: float | None = None  # expected
     out: str = ""  # where the command writes; empty: to `run` in the folder
@@ -98,10 +98,12 @@ def run_job(job: Job) -> dict[str, Any]:
 def _trained(job: Job, out: Path) -> dict[str, Any]:
     import pandas as pd
 
+    from .runs import commits
+
     folder = out / "{task}-{recipe}-seed{seed}".format(**job.labels)
     manifest = read_json(folder / "manifest.json")
     curve = json.loads(pd.read_csv(folder / "metrics.csv").to_json(orient="records", double_precision=15))
-    return {"row": manifest["results"] | {"commit": manifest["machine"]["git"]}, "curve": curve, "settings": manifest["parameters"]}
+    return {"row": manifest["results"] | {"commit": commits(manifest)}, "curve": curve, "settings": manifest["parameters"]}
 
 
 def _imitated(job: Job, out: Path) -> dict[str, Any]:
@@ -120,7 +122,7 @@ def base_settings(card: dict[str, Any]) -> dict[str, Any]:
 
 
 def _played(job: Job, out: Path) -> dict[str, Any]:
-    return {"row": _scalars(job.parameters) | _scalars(read_json(out / RESULT)), "curve": []}
+    return {"row": _scalars(job.parameters) | _scalars(read_json(out / RESULT)), "curve": [], "settings": job.config}
 
 
 def _scalars(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -20,7 +20,7 @@ from .demos import Demos, sources
 from .demos.cli import Progress
 from .errors import PdkitError
 from .evaluate import evaluate
-from .files import DATA, atomic_file, atomic_folder, check_replaceable, read_json, runs_root, write_json
+from .files import DATA, atomic_file, atomic_folder, check_replaceable, code_checksum, read_json, runs_root, write_json
 from .imitate import configured, imitate
 from .methods import METHODS
 from .methods.registry import base_folder as shipped_base
@@ -36,7 +36,7 @@ from .policies import POLICIES, Policy, load_policy, save_policy
 from .policies.base import read_card
 from .profiles import PROFILES, differences, flat
 from .recorded import record
-from .runs import Run, describe_machine, origin
+from .runs import Run, commits, describe_machine, origin
 from .seeds import reported_seeds
 from .sweep_spec import check_names
 from .tasks import get_task
@@ -177,7 +177,7 @@ def _decorated(args) -> int:
         if encoder and demos:
             demos = encoded(demos, pictures_of(demos, Progress(demos.num, "drawn")), encoder)
         row = decorate(config, base, demos, out, args.episodes, started_from, args.tensorboard, encoder)
-        row |= {"recipe": args.recipe, "command": command_of(args, seed), "commit": read_json(out / "manifest.json")["machine"]["git"]}
+        row |= {"recipe": args.recipe, "command": command_of(args, seed), "commit": commits(read_json(out / "manifest.json"))}
         print(", ".join(f"{k} {v}" for k, v in row.items()), flush=True)
         if args.record:
             curves = pd.read_csv(out / "metrics.csv").assign(task=args.task, seed=seed, recipe=args.recipe)
@@ -215,8 +215,8 @@ def decorate(config, base: Policy, demos: Demos | None, out: Path, episodes: int
             with atomic_file(out / f"{name}_episodes.csv") as temporary:
                 table.to_csv(temporary, index=False)
         row = dict(task=config.task, method=config.method, policy=base.kind, seed=config.seed,
-                   train_minutes=round(trainer.train_seconds / 60, 2), cores=describe_machine()["cores"], env_steps=trainer.step,
-                   first_reward_step=trainer.first_reward or None,
+                   train_minutes=round(trainer.train_seconds / 60, 2), cores=describe_machine()["cores"], bf16=trainer.in_bf16,
+                   env_steps=trainer.step, first_reward_step=trainer.first_reward or None,
                    updates=trainer.agent.updates, episodes=episodes,
                    **_outcome("base", tables["base"]), **_outcome("decorated", tables["decorated"]),
                    load_average=round(os.getloadavg()[0], 1) if hasattr(os, "getloadavg") else None)
@@ -263,8 +263,8 @@ def _base_episodes(base: Policy, spec: TaskSpec, episodes: int, config: OnlineCo
     once and kept."""
     draw = [config.seed] if base.samples else []
     weights = [started_from[name] for name in ("base", "encoder", "objects") if name in started_from]
-    here = describe_machine()
-    what = json.dumps([spec.name, config.start_fraction, episodes, *weights, base.kind, base.config, here["versions"], here["git"], *draw])
+    what = json.dumps([spec.name, config.start_fraction, episodes, *weights, base.kind, base.config, describe_machine()["versions"],
+                       code_checksum(), *draw])
     kept = runs_root() / "base_episodes" / f"{spec.name}-{hashlib.sha256(what.encode()).hexdigest()[:16]}.csv"
     if not kept.exists():
         table = _episodes(base, spec, episodes, config.seed)

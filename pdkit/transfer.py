@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import argparse
+import itertools
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
@@ -105,8 +106,9 @@ def film(policy: Policy | Decorated | JumpStart, spec: TaskSpec, path: str | Pat
     return written
 
 
-def refuse_to_replace(name: str, tasks: Sequence[str], recipes: Sequence[str], folder: str) -> None:
-    """Raise PdkitError where data/results/NAME holds one of these rows (a task and recipe each) of a policy in another folder.
+def refuse_to_replace(name: str, tasks: Sequence[str], recipes: Sequence[str], folder: str, sampling: dict[str, Any] | None = None) -> None:
+    """Raise PdkitError where data/results/NAME holds one of these rows (a task and recipe each) of a policy in another folder, or of the
+    same one that sampled otherwise.
 
     A row is known by its task and recipe, which do not tell two policies of one kind apart: recording would replace the other's.
     """
@@ -117,7 +119,9 @@ def refuse_to_replace(name: str, tasks: Sequence[str], recipes: Sequence[str], f
     for row in rows[rows.task.isin(tasks) & rows.recipe.isin(recipes)].itertuples():
         words = shlex.split(str(row.command))  # pdkit evaluate FOLDER ..., or what else made the row
         holder = words[2] if words[:2] == ["pdkit", "evaluate"] else row.command
-        if Path(holder).resolve() != Path(folder).resolve():
+        drawn = [*itertools.takewhile(lambda word: not word.startswith("--"), words[words.index("--sampling") + 1:])] \
+            if "--sampling" in words else []
+        if Path(holder).resolve() != Path(folder).resolve() or parse_settings(drawn, "--sampling") != (sampling or {}):
             raise PdkitError(f"data/results/{name}.csv holds {row.task}'s {row.recipe!r} of {holder}, which recording {folder} would "
                              "replace; choose another name for --record (without --oracle: or --recipe), or take that row out first.")
 
@@ -179,7 +183,7 @@ def main(argv: list[str]) -> int:
         return corrected(kind, policy, args)
     recipe = args.recipe or ",".join([kind, *(f"{name}={type(DiffusionPolicy.defaults[name])(value)}" for name, value in settings.items())])
     if args.record:
-        refuse_to_replace(args.record, args.tasks, [recipe], args.policy)
+        refuse_to_replace(args.record, args.tasks, [recipe], args.policy, settings)
     rows = transfer(policy, args.tasks, args.episodes, encoder_of(args.policy))
     for row in rows.itertuples():
         print(f"{row.task}: {wilson(round(row.success * row.episodes), row.episodes)}; at the last step {row.success_at_end:.1%}")

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from pdkit import runs
 from pdkit.errors import PdkitError
 from pdkit.files import atomic_folder, check_replaceable, locked, recover
 
@@ -98,3 +99,18 @@ def test_one_process_at_a_time_works_behind_a_lock(tmp_path, monkeypatch):
 
 def refuse(*_):
     raise OSError(errno.ENOLCK, "No locks available")
+
+
+def test_a_run_that_another_code_resumes_names_both(tmp_path, monkeypatch):
+    """What was computed half by one commit, half by another is neither's; opening it again with the same one adds nothing."""
+    found = {"git": "one", "cores": 2}
+    monkeypatch.setattr(runs, "describe_machine", lambda: dict(found))
+    runs.Run(tmp_path, "online", {"a": 1})
+    assert runs.commits(runs.Run(tmp_path, "online", {"a": 1}).manifest) == "one"
+    found["git"] = "two"
+    for _ in range(2):
+        assert runs.commits(runs.Run(tmp_path, "online", {"a": 1}).manifest) == "one then two"
+    runs.Run(tmp_path, "online", {"a": 1}).finish()
+    found["git"] = "three"  # only reads what is finished
+    manifest = runs.Run(tmp_path, "online", {"a": 1}).manifest
+    assert runs.commits(manifest) == "one then two" and len(manifest["resumed"]) == 1

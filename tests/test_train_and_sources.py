@@ -187,6 +187,8 @@ def test_training_from_the_command_line_records_a_row_a_seed(monkeypatch, tmp_pa
     assert call(monkeypatch, *words) == 0 and pd.read_csv(tmp_path / "results" / "t.csv").base_success[0] == 0.25
     assert call(monkeypatch, *words, "--episodes", "3") == 0  # of other episodes there are others
     assert pd.read_csv(tmp_path / "results" / "t.csv").base_success[0] != 0.25
+    monkeypatch.setattr(train, "code_checksum", lambda: "edited")  # another task, perhaps: its base policy is tested anew
+    assert call(monkeypatch, *words) == 0 and pd.read_csv(tmp_path / "results" / "t.csv").base_success[0] == table.base_success[0]
     policy = load_decorated(tmp_path / "runs" / "train" / "Door-lesson-seed0" / "decorated")
     base = load_policy(DATA / "checkpoints" / "Door" / "base")
     assert policy.base.state_dict().keys() == base.state_dict().keys()

@@ -163,6 +163,10 @@ def test_a_diffusion_policy_samples_as_asked_and_others_do_not(tmp_path, monkeyp
     assert [(config["temperature"], chunk) for config, chunk in seen] == [(1.0, 2), (0, 1)]
     table = pd.read_csv(tmp_path / "data" / "results" / "s.csv").set_index("recipe")
     assert table.command["base,temperature=0.0,chunk=1"] == " ".join(["pdkit", *words, *other])
+    named = [*words, "--record", "s", "--recipe", "mine", "--sampling", "chunk=1"]
+    assert cli.main([*named, "temperature=0"]) == cli.main([*named, "temperature=0.0"]) == 0
+    capsys.readouterr()
+    assert cli.main([*named, "temperature=0.5"]) == 2 and "holds reach's 'mine'" in capsys.readouterr().err
     assert "base" in table.index
     capsys.readouterr()
     for asked, told in (("horizon=8", "Unknown sampling"), ("temperature", "--sampling takes NAME=VALUE"), ("chunk=9", "fit between"),

@@ -127,7 +127,8 @@ METHODS: dict[str, Method] = {
         "DPPO", "Ren et al. 2024; appendix C.2, H.2; facts.md 3.8: PPO on the denoising steps of a Diffusion Policy",
         changes=_ON_POLICY | _OWN_POLICY | dict(lora=0, ppo_lr=1e-4, ppo_grad_clip=1e6),  # in effect none
         # Chunks are fewer decisions, each with four steps to learn from: smaller rollouts, fewer passes. Not tuned either.
-        lesson=dict(ppo_rollout=32, ppo_minibatches=4, ppo_epochs=5), paper=dict(ppo_rollout=400, ppo_minibatches=20, gamma=0.999),
+        lesson=dict(ppo_rollout=32, ppo_minibatches=4, ppo_epochs=5),
+        paper=_ON_POLICY_PAPER | dict(ppo_rollout=400, ppo_minibatches=20, gamma=0.999),
         base="diffusion", trainer="pdkit.methods.dppo:DPPO"),
     "jsrl": Method(
         "JSRL", "Uchendu et al. 2023; appendix B.5; facts.md 3.4: the base policy begins each episode, a learner from scratch ends it",

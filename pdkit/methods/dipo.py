@@ -2,7 +2,8 @@
 
 The paper modifies the original in two ways, both here: of a predicted sequence only the executed chunk is moved by the action
 gradient, and the policy learns through LoRA on all layers (peft has none for transposed convolutions: pdkit/policies/lora.py). It gives
-neither the rank nor the numbers of the action gradient: these are the original's (20 Adam steps of 0.03; in DPPO's port 10 of 1e-4).
+neither the rank nor the numbers of the action gradient: these are the original's (20 Adam steps of 0.03, in the lesson 10 of them; in
+DPPO's port 10 of 1e-4).
 The rest is the SAC methods' (appendix B.5: shared settings).
 
 Not as in the original: it explores by 10,000 random steps first, here the imitated policy acts from the start and its own noise

@@ -135,7 +135,8 @@ class JSRL(Trainer):
         if evaluations.pending:
             self._collect(evaluations, None, wait=True)
             own, scores = self.config.method_config, [row["success_once"] for row in self.rows if "success_once" in row]
-            if may_advance(scores, own.jsrl_window, own.jsrl_tolerance):
+            over = self.step >= self.config.total_steps  # nobody evaluates a horizon that falls now
+            if not over and may_advance(scores, own.jsrl_window, own.jsrl_tolerance):
                 self._set_guide_steps(max(self.guide_steps - own.jsrl_step, 0))
 
     def _row(self):
