@@ -4,7 +4,8 @@ from __future__ import annotations
 import platform
 import subprocess
 import time
-from contextlib import AbstractContextManager
+from collections.abc import Iterator
+from contextlib import contextmanager
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
@@ -77,9 +78,6 @@ class Run:
         if self.manifest_path.exists():
             self.manifest = read_json(self.manifest_path)
             self._must_match(kind, parameters)
-            if not self.finished and (machine := describe_machine()) != self._machines()[-1]:
-                self.manifest.setdefault("resumed", []).append({"at": _now(), "machine": machine})
-                self._write_manifest()
         else:
             self.manifest = {"kind": kind, "parameters": parameters, "started": _now(), "finished": None, "machine": describe_machine()}
             self._write_manifest()
@@ -94,15 +92,21 @@ class Run:
             raise PdkitError(f"{self.folder} holds another run (differing: {', '.join(differing) or 'kind'}); choose another folder or "
                              "delete this one.")
 
-    def _machines(self) -> list[dict[str, Any]]:
-        return machines(self.manifest)
-
     def _write_manifest(self) -> None:
         write_json(self.manifest_path, self.manifest)
 
-    def alone(self) -> AbstractContextManager[None]:
-        """Within this block no other process works in this folder. Raises PdkitError where one does."""
-        return locked(self.folder / "lock", f"Another process is at work in {self.folder}; wait for it, or choose another folder.")
+    @contextmanager
+    def alone(self) -> Iterator[None]:
+        """Within this block no other process works in this folder. Raises PdkitError where one does.
+
+        Where an unfinished run goes on with other code or on another machine, its manifest says so (`resumed`).
+        """
+        with locked(self.folder / "lock", f"Another process is at work in {self.folder}; wait for it, or choose another folder."):
+            self.manifest = read_json(self.manifest_path)
+            if not self.finished and (machine := describe_machine()) != machines(self.manifest)[-1]:
+                self.manifest.setdefault("resumed", []).append({"at": _now(), "machine": machine})
+                self._write_manifest()
+            yield
 
     @property
     def finished(self) -> bool:

@@ -103,14 +103,19 @@ def refuse(*_):
 
 def test_a_run_that_another_code_resumes_names_both(tmp_path, monkeypatch):
     """What was computed half by one commit, half by another is neither's; opening it again with the same one adds nothing."""
+    def opened():
+        run = runs.Run(tmp_path, "online", {"a": 1})
+        with run.alone():
+            return run
+
     found = {"git": "one", "cores": 2}
     monkeypatch.setattr(runs, "describe_machine", lambda: dict(found))
     runs.Run(tmp_path, "online", {"a": 1})
     assert runs.commits(runs.Run(tmp_path, "online", {"a": 1}).manifest) == "one"
     found["git"] = "two"
     for _ in range(2):
-        assert runs.commits(runs.Run(tmp_path, "online", {"a": 1}).manifest) == "one then two"
+        assert runs.commits(opened().manifest) == "one then two"
     runs.Run(tmp_path, "online", {"a": 1}).finish()
     found["git"] = "three"  # only reads what is finished
-    manifest = runs.Run(tmp_path, "online", {"a": 1}).manifest
+    manifest = opened().manifest
     assert runs.commits(manifest) == "one then two" and len(manifest["resumed"]) == 1

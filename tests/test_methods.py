@@ -170,6 +170,11 @@ def test_fish_shows_its_critics_what_is_added(profile):
     assert (config.critic_input, config.residual_units, config.alpha) == ("concat", "action", 0.2)
 
 
+@pytest.mark.parametrize("method", ["ppo_decorator", "ppo_residual_rl", "ppo_finetune", "dppo"])
+def test_what_learns_on_policy_normalises_observations_at_full_scale_too(method):
+    assert method_config(method, "StackCube", "paper").normalize_obs
+
+
 @pytest.mark.parametrize("profile", ["lesson", "paper"])
 def test_the_papers_rlpd_adds_layer_norm_and_demonstrations_to_fine_tuning(profile):
     """Appendix B.5: and neither ensemble nor a high update-to-data ratio."""
