@@ -133,7 +133,7 @@ def conservative(answer: Callable, strict: bool = False) -> bool:
         if abs(got - term()) > 1e-6:
             yield next((said for value, said in mistakes.items() if abs(got - value) < 1e-6), f"it gives {got:.4f}, not {term():.4f}.")
         low = float(answer(data - 900, random - 900, policy - 900, log_pi, returns - 900, d))
-        if not abs(low - term()) < 1e-6:
+        if not abs(low - term()) < 0.01:  # in float32, too, where numbers near 900 have four decimals
             yield (f"with all values and returns 900 lower it gives {low:.4f}, not {term():.4f} as before: take the largest out before the "
                    "exponential (np.logaddexp.reduce does).")
 
