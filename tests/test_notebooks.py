@@ -421,6 +421,7 @@ def test_exercises_accept_solutions_and_name_mistakes(capsys):
         (check.cosines, lambda a, b: (a * b).sum(1) / np.sqrt((a * a).sum(1) * (b * b).sum(1)), "row of zeros in first"),
         (check.cosines, lambda a, b: np.where((a == 0).all(1), 0, (a * b).sum(1) / np.sqrt((a * a).sum(1) * (b * b).sum(1))),
          "row of zeros in second"),
+        (check.cosines, lambda a, b: unlearning.cosines(a, b) * (a.any(1) & b.any(1)).all(), "changes what the other rows give"),
         (check.cosines, lambda a, b: np.tensordot(a, b), "last axis"),
         (check.temperature_step, lambda x, h, t, lr: x - lr * (h - t), "solved"),
         (check.temperature_step, by_autograd, "solved"),

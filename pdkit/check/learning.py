@@ -57,8 +57,12 @@ def cosines(answer: Callable, strict: bool = False) -> bool:
             yield f"the first cosine is {got[0]:.3f}, not {expected[0]:.3f}."
         first[2] = second[4] = 0
         got = np.asarray(answer(first, second))
-        if wrong := [row for row in (2, 4) if got[row] != 0]:
-            yield f"for a row of zeros in {'first' if wrong[0] == 2 else 'second'} it gives {got[wrong[0]]}, not 0."
+        for row, where in ((2, "first"), (4, "second")):
+            if got[row] != 0:
+                yield f"for a row of zeros in {where} it gives {got[row]}, not 0."
+            expected[row] = 0
+        if not np.allclose(got, expected):
+            yield "a row of zeros changes what the other rows give."
 
     return judge("cosines", complaints, strict)
 
