@@ -49,7 +49,7 @@ def code_cells(notebook: nbformat.NotebookNode) -> list[nbformat.NotebookNode]:
     return [cell for cell in notebook.cells if cell.cell_type == "code"]
 
 
-def code_checksum(path: Path) -> str:
+def notebook_checksum(path: Path) -> str:
     """Of what a notebook's code cells do, without comments and blanks, and without the parameters cell, whose values are told apart."""
     def meant(source: str) -> str:
         try:

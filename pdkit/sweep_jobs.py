@@ -17,7 +17,7 @@ from .files import ROOT, read_json, runs_root
 from .imitate import ImitateConfig, configured, untrained
 from .main_job import evaluation_minutes, expected_minutes
 from .methods.registry import base_folder, method_config, trainer_of
-from .nb_cells import code_checksum
+from .nb_cells import notebook_checksum
 from .policies import Policy, load_policy
 from .policies.base import read_card
 from .profiles import flat
@@ -202,7 +202,7 @@ def _notebook(spec: Spec, cell: dict[str, Any], seed: int) -> Job:
     words = ["nb", name, *(word for k, v in values.items() for word in ("-p", f"{k}={json.dumps(v)}"))]
     labels = {"task": str(values.get("task", stem)), "recipe": recipe, "seed": seed}
     return _job(spec, {"notebook": name, "recipe": recipe} | values, labels, words, like=name, minutes=spec.minutes,
-                config={"the notebook's code": code_checksum(path)})
+                config={"the notebook's code": notebook_checksum(path)})
 
 
 def _job(spec: Spec, parameters: dict[str, Any], labels: dict[str, Any], words: list[str], **others: Any) -> Job:
