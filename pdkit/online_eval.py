@@ -17,7 +17,7 @@ from .errors import PdkitError
 from .evaluate import selection_scores
 from .policies import Policy
 from .tasks.spec import TaskSpec
-from .torch_setup import set_threads
+from .torch_setup import one_thread, set_threads
 
 LANES = 25  # episodes side by side in one evaluation
 DIED = "The process that evaluates died; run `pdkit doctor`, or set eval_workers=0 to see its error."
@@ -97,7 +97,8 @@ class Evaluations:
 def _score(spec: TaskSpec, policy: Policy | Decorated, actor: nn.Module, episodes: int, seed: int, weights: State) -> dict[str, float]:
     started = time.monotonic()
     actor.load_state_dict(weights)
-    return selection_scores(spec, policy, episodes, seed, LANES) | {"eval_seconds": time.monotonic() - started}
+    with one_thread():  # as in the other process: scores choose the policy
+        return selection_scores(spec, policy, episodes, seed, LANES) | {"eval_seconds": time.monotonic() - started}
 
 
 def _worker(pipe, arguments) -> None:

@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+from collections.abc import Iterator
 
 import torch
 
@@ -13,6 +14,19 @@ from .machine import cpu_has_bf16
 def set_threads(num: int) -> None:
     """Use `num` threads for matrix work in this process. Two processes with two threads each on two cores are ten times slower."""
     torch.set_num_threads(max(1, num))
+
+
+@contextlib.contextmanager
+def one_thread() -> Iterator[None]:
+    """Within this block torch computes with one thread: what one process does must round as it would in a worker."""
+    threads = torch.get_num_threads()
+    if threads > 1:
+        torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        if threads > 1:
+            torch.set_num_threads(threads)
 
 
 def pick_device(name: str = "auto") -> str:

@@ -155,6 +155,8 @@ def test_the_target_takes_the_best_of_the_samples_by_the_lower_critic_without_en
         learner = by_formula(agent(Conservative(max_target=best)), lambda s, a, _: s + a)
         target = learner.td_target(data, data["next_obs"], torch.randn(1, 2), temperature=torch.tensor(100.0))
         assert target.item() == pytest.approx(-1 + 0.9 * expected, rel=1e-5)
+        drawn = learner.td_target(data, data["next_obs"], torch.randn(1, 2), torch.tensor(100.0), members=[1])  # the higher one alone
+        assert drawn.item() == pytest.approx(-1 + 0.9 * (expected + 1), rel=1e-5)
 
 
 def test_samples_come_with_the_densities_of_their_actions(bet_sac):  # noqa: F811
@@ -255,8 +257,11 @@ def test_in_setup_e_the_actor_starts_over_and_the_critics_go_on(bet_sac):  # noq
         {n for n, _ in trainer.agent.actor.named_parameters() if "lora_" in n or n.startswith("spread.")}
     assert all(torch.equal(v, before[k]) for k, v in bet_sac.state_dict().items())
     assert trainer.agent.critic_optimizer.state  # not made anew
+    assert trainer.agent.log_temperature.item() == pytest.approx(math.log(trainer.config.sac.init_temperature), abs=1e-6)
+    assert not trainer.agent.temperature_optimizer.state  # the temperature is the actor's, and starts over with it
     offline = [r for r in trainer.rows if r["step"] == 0]
     assert len(offline) == 10 and offline[-1]["actor_loss"] != offline[0]["actor_loss"]
+    assert offline[-1]["temperature"] != pytest.approx(trainer.config.sac.init_temperature, rel=1e-3)  # it had moved
 
 
 def test_the_average_of_setup_e_forgets_the_offline_stage(bet_sac):  # noqa: F811

@@ -66,6 +66,8 @@ def test_offsets_live_before_the_tanh():
     assert np.allclose(action, expected, atol=1e-5) and action[0] > 1  # the environment clips
     terms = policy.loss(torch.zeros(1, 3, 4), torch.from_numpy(expected.astype(np.float32)).expand(1, 3, 2))
     assert terms["offset_mse"].item() == pytest.approx(0, abs=1e-6)
+    terms = policy.loss(torch.zeros(1, 3, 4), torch.zeros(1, 3, 2))
+    assert terms["offset_mse"] > 0.01 and torch.allclose(terms["loss"], terms["focal"] + 1000 * terms["offset_mse"])  # as the plain one
 
 
 def test_log_probability_is_that_of_the_squashed_gaussian(bet_sac):

@@ -295,6 +295,57 @@ def test_the_result_is_the_best_evaluated_policy_or_the_last(tmp_path):
     assert not torch.equal(actors[min(actors)], actors[max(actors)])
 
 
+def scripted(monkeypatch, scores):
+    """Evaluations in this process give these, as (once, at the end), one after the other."""
+    told = iter([{"success_once": once, "success_at_end": end} for once, end in scores])
+    monkeypatch.setattr("pdkit.online_eval.selection_scores", lambda *_: next(told))
+
+
+@pytest.mark.parametrize(("H", "best"), [(0, 200), (300, 400)])
+def test_an_evaluation_before_the_gate_is_fully_open_chooses_no_policy(monkeypatch, H, best):
+    scripted(monkeypatch, [(0.1, 0.1), (0.9, 0.9), (0.2, 0.2), (0.3, 0.3)])
+    c = config(eval_every=100, decorator=DecoratorConfig(alpha=0.6, H=H))
+    trainer, actors = Trainer(c, biased_base(), spec=SPEC), {}
+    policy = trainer.train(progress=lambda t: actors.setdefault(t.step, t.agent.average.head.bias.clone()))
+    assert torch.equal(policy.actor.head.bias, actors[best]) and not torch.equal(actors[200], actors[400])
+
+
+@pytest.mark.parametrize(("on_success", "best", "score"), [("terminate", 300, 0.9), ("continue", 400, 0.8)])
+def test_where_episodes_go_on_after_success_staying_solved_counts_half(monkeypatch, on_success, best, score):
+    scripted(monkeypatch, [(0.5, 0.5), (0.6, 0.6), (0.9, 0.1), (0.8, 0.8)])
+    c = config(eval_every=100, on_success=on_success, decorator=DecoratorConfig(alpha=0.6, H=0))
+    trainer, actors = Trainer(c, biased_base(), spec=SPEC), {}
+    policy = trainer.train(progress=lambda t: actors.setdefault(t.step, t.agent.average.head.bias.clone()))
+    assert trainer.best_score == pytest.approx(score)
+    assert torch.equal(policy.actor.head.bias, actors[best]) and not torch.equal(actors[300], actors[400])
+
+
+def test_the_best_policy_so_far_outlives_a_kill(monkeypatch, tmp_path):
+    """The best evaluation lies before the kill, a worse one after it."""
+    c = config(eval_every=100, decorator=DecoratorConfig(alpha=0.6, H=0))
+    scores = [(0.1, 0.1), (0.9, 0.9), (0.2, 0.2), (0.3, 0.3)]
+    scripted(monkeypatch, scores)
+    whole = Trainer(c, biased_base(), spec=SPEC)
+    policy = whole.train()
+
+    def killed(t):
+        if t.step >= 300:
+            raise KeyboardInterrupt
+
+    scripted(monkeypatch, scores)
+    run = Run(tmp_path, "online", flat(c))
+    with pytest.raises(KeyboardInterrupt):
+        Trainer(c, biased_base(), spec=SPEC).train(run, killed)
+    assert run.load_checkpoint()[1]["step"] == 200
+    scripted(monkeypatch, scores[2:])
+    resumed = Trainer(c, biased_base(), spec=SPEC)
+    again = resumed.train(run)
+    assert resumed.best_score == whole.best_score == 0.9
+    one, other = policy.actor.state_dict(), again.actor.state_dict()
+    assert all(torch.equal(one[k], other[k]) for k in one)
+    assert not torch.equal(one["head.bias"], whole.agent.average.head.bias)  # the last is another
+
+
 @pytest.mark.parametrize("critic_warmup", [0, 60])
 def test_what_has_not_learned_yet_is_never_the_result(monkeypatch, critic_warmup):
     """Without a gate evaluations count from the first on, and those in the warm-up are of what the run started from."""

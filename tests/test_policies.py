@@ -3,6 +3,7 @@ import json
 import shutil
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 
@@ -10,10 +11,11 @@ from pdkit import train
 from pdkit.demos.format import from_episodes
 from pdkit.errors import PdkitError
 from pdkit.gradient_steps import make_optimizer
-from pdkit.imitate import ImitateConfig, Windows, imitate, untrained
+from pdkit.imitate import Average, ImitateConfig, Windows, best_checkpoint, imitate, untrained
 from pdkit.policies import POLICIES, BeT, load_policy, save_policy
 from pdkit.policies.base import Normalizer, share_weights
 from pdkit.policies.bet import focal_loss
+from pdkit.seeds import DEMOS, SELECT, TEST, TRAIN, reported_seeds, rollout_seeds, selection_seeds, training_seed
 from pdkit.tasks import get_task
 
 SMALL = dict(obs_dim=3, act_dim=2, window=4, bins=3, layers=2, heads=2, embed=16, features=16)
@@ -188,6 +190,56 @@ def test_a_learning_rate_that_rises_from_0_moves_nothing_at_the_first_step():
         fresh = untrained("mlp", get_task("Door"), dict(hidden=8))
         moved.append(any(not torch.equal(p, q) for p, q in zip(policy.parameters(), fresh.parameters(), strict=True)))
     assert moved == [True, False]
+
+
+def test_the_best_of_the_evaluations_is_kept_and_training_goes_on_as_before(monkeypatch):
+    """With its dropout on again after each, and not while it is evaluated."""
+    scores, seen, modes = iter([0.25, 0.75, 0.5]), [], []
+
+    def told(spec, policy, episodes, seed):
+        seen.append({k: v.clone() for k, v in policy.state_dict().items()})
+        modes.append(policy.training)
+        return {"success_once": next(scores), "success_at_end": 0.0}
+
+    loss = BeT.loss
+    monkeypatch.setattr(BeT, "loss", lambda self, *batch: modes.append(self.training) or loss(self, *batch))
+    monkeypatch.setattr("pdkit.imitate.selection_scores", told)
+    settings = ImitateConfig(iterations=6, batch=16, lr=1e-2, eval_episodes=1, eval_every=2, bf16=False)
+    policy, history = imitate("bet", line_demos(), settings, dict(window=4, bins=2, layers=1, heads=2, embed=16, features=16))
+    assert [row["success_once"] for row in history] == [0.25, 0.75, 0.5]
+    kept = policy.state_dict()
+    assert all(torch.equal(kept[k], seen[1][k]) for k in kept) and not torch.equal(kept["head.weight"], seen[2]["head.weight"])
+    assert modes == 3 * [True, True, False] and not policy.training
+
+
+def test_every_gradient_step_has_the_rate_of_the_schedule():
+    weight = torch.nn.Parameter(torch.zeros(()))
+    settings = ImitateConfig(iterations=6, eval_every=6, lr=0.5, schedule="cosine", lr_warmup=2)
+    optimizer, rates = torch.optim.SGD([weight], lr=settings.lr), []
+
+    def step():
+        rates.append(optimizer.param_groups[0]["lr"])
+        optimizer.step()
+        return {"loss": torch.zeros(())}
+
+    best_checkpoint(settings, step, optimizer, Average([weight], 0.0), lambda: (None, {}), None)
+    assert rates == pytest.approx([0, 0.25, 0.5, 0.25 * (1 + 0.5**0.5), 0.25, 0.25 * (1 - 0.5**0.5)])
+
+
+def test_policies_are_chosen_on_selection_episodes_and_reported_on_others(monkeypatch):
+    asked, selection = [], [SELECT, SELECT + 1, SELECT + 2]
+
+    def evaluate(spec, act, seeds, **others):
+        asked.append(list(seeds))
+        return pd.DataFrame({"success_once": [True], "success_at_end": [False]})
+
+    monkeypatch.setattr("pdkit.evaluate.evaluate", evaluate)
+    settings = ImitateConfig(iterations=2, batch=16, eval_episodes=3, eval_every=1, bf16=False)
+    imitate("mlp", line_demos(), settings, dict(hidden=8))
+    assert asked == [selection, selection] and selection_seeds(3) == selection
+    assert DEMOS < TEST <= min(reported_seeds(1)) and max(reported_seeds(10_000)) < SELECT
+    assert max(selection_seeds(10_000)) < min(rollout_seeds(1)) and max(rollout_seeds(10_000)) < TRAIN
+    assert all(training_seed(0, lane, episode) >= TRAIN for lane in range(4) for episode in range(50))
 
 
 BAD = [  # policy, setting as typed, what the sentence must name

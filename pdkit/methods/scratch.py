@@ -13,7 +13,8 @@ demonstrations, ten critics with LayerNorm and no entropy in their target,
 
 with batches of 256, rates of 3e-4, tau 0.005, gamma 0.99 and 5,000 random steps first (paper profile). The lesson makes one update a
 step, because ten critics cost four times two, and its rates, batches and first temperature are the profile's. Not as in the original:
-its offline data hold rollouts of a cloned policy as well, and a tenth of each is kept aside.
+its offline data hold rollouts of a cloned policy as well, and a tenth of each is kept aside; gradients are clipped at a norm of 50 as in
+this kit's SAC, where the original names no limit.
 """
 from __future__ import annotations
 

@@ -7,21 +7,19 @@ That is what the paper's code does (facts.md 1.3): residual and critic see the f
 """
 from __future__ import annotations
 
-import contextlib
 import copy
 import functools
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from ..errors import PdkitError
 from ..files import atomic_folder
 from ..policies import Policy, save_policy
 from ..tasks.spec import TaskSpec
+from ..torch_setup import one_thread
 from .cameras import VIEWS
 from .encoders import FEATURES, Encoder, load_encoder, save_encoder
 from .sim import Frame, PixelSim, panels
@@ -44,7 +42,7 @@ class FeatureSim:
 
     def _observe(self, frame: Frame) -> np.ndarray:
         self._frame = frame
-        with one_thread():
+        with one_thread():  # a picture is little work
             features = self._encoder.encode(frame.rgb[None], frame.depth[None])[0]
         return np.concatenate([frame.state, features])
 
@@ -54,19 +52,6 @@ class FeatureSim:
 
     def close(self) -> None:
         self._sim.close()
-
-
-@contextlib.contextmanager
-def one_thread() -> Iterator[None]:
-    """Within this block torch computes with one thread: a worker must round as this process does, and a picture is little work."""
-    threads = torch.get_num_threads()
-    if threads > 1:
-        torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        if threads > 1:
-            torch.set_num_threads(threads)
 
 
 def pixel_spec(spec: TaskSpec, encoder: Encoder) -> TaskSpec:

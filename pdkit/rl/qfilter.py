@@ -26,9 +26,9 @@ class QFilteredSAC(SAC):
         """A scalar, on demonstrations drawn with `generator`."""
         raise NotImplementedError
 
-    def update(self, batch: dict[str, torch.Tensor], generator: torch.Generator) -> dict[str, torch.Tensor]:
+    def update(self, batch: dict[str, torch.Tensor], generator: torch.Generator, critics: bool = True) -> dict[str, torch.Tensor]:
         self._generator = generator
-        return super().update(batch, generator)
+        return super().update(batch, generator, critics)
 
     def filter_weight(self, batch: dict[str, torch.Tensor], obs: torch.Tensor, value: torch.Tensor) -> torch.Tensor:
         """w for normalised observations and the values (B,) of the actor's own actions."""

@@ -47,22 +47,17 @@ def walk(sim: Sim, guide: Guide, seed: int, limit: int) -> np.ndarray | None:
 
     Leaves torch as it was: a base policy may draw from its global generator, and a guide in a worker must round as one in this process.
     """
-    import torch
+    from ..torch_setup import one_thread
 
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        with own_random_numbers():
-            guide.reset(seed)
-            window, actions = np.repeat(sim.reset(seed)[None], guide.window, axis=0), []
-            while len(actions) < limit:
-                actions.append(np.clip(guide.act(window[None])[0, 0], -1, 1).astype(np.float32))
-                observation, solved = sim.step(actions[-1])
-                if solved:
-                    return np.stack(actions)
-                window = np.concatenate([window[1:], observation[None]])
-    finally:
-        torch.set_num_threads(threads)
+    with one_thread(), own_random_numbers():
+        guide.reset(seed)
+        window, actions = np.repeat(sim.reset(seed)[None], guide.window, axis=0), []
+        while len(actions) < limit:
+            actions.append(np.clip(guide.act(window[None])[0, 0], -1, 1).astype(np.float32))
+            observation, solved = sim.step(actions[-1])
+            if solved:
+                return np.stack(actions)
+            window = np.concatenate([window[1:], observation[None]])
     return None
 
 
