@@ -17,7 +17,7 @@ from .plots import COLORS, Picture, _columns, _percent, blank, styled
 from .stats import Interval, iqm, stratified_bootstrap
 
 PALETTE = ["#1f6fb4", "#d1495b", "#2c9f6b", "#e0a030", "#7a4fa3", "#17a2b8", "#a8542a", "#e377c2", "#5f6b1f", "#3c3c46", "#9cc3e6",
-           "#f4a6a0", "#98cfa9", "#c7b42c", "#5b4a8a"]
+           "#f4a6a0", "#98cfa9", "#c7b42c", "#5b4a8a", "#00c9a7", "#ff8c42", "#b79be0", "#0b3d2e"]  # enough for a leaderboard
 BOOTSTRAP_SEED = 0  # of every interval here: a figure drawn twice is the same
 
 
@@ -99,14 +99,16 @@ def curves_figure(curves: pd.DataFrame, *, column: str = "success_once", labels:
 
 @styled
 def finals_figure(table: pd.DataFrame, *, column: str = "decorated_success", labels: dict[str, str] | None = None,
-                  base: float | None = None, own: pd.DataFrame | None = None, title: str = "", xlabel: str = "",
-                  log: bool = False) -> Picture:
+                  base: float | None = None, own: pd.DataFrame | None = None, order: Sequence[str] = (), title: str = "",
+                  xlabel: str = "", log: bool = False) -> Picture:
     """`column` at the end: a row a recipe with a dot a seed, the interquartile mean and its bootstrap interval over seeds.
 
-    `own` holds the reader's rows, drawn as open circles; the other arguments are those of `curves_figure`.
+    `own` holds the reader's rows, drawn as open circles; `order` names the recipes that come first, from the top, where that is another
+    order than that of the colours; the other arguments are those of `curves_figure`.
     """
     _columns(table, "recipe", "seed", column)
     names = labelled(table, labels, own)
+    names = {recipe: names[recipe] for recipe in dict.fromkeys([*(r for r in order if r in names), *names])}
     color, found = colours(labels or names), summary(table, column, labels).set_index("recipe")
     figure, axes = blank(size=(7.2, 1.2 + 0.42 * len(names)))
     ax = axes[0, 0]
@@ -127,7 +129,7 @@ def finals_figure(table: pd.DataFrame, *, column: str = "decorated_success", lab
     ax.set_ylim(-0.6, len(names) - 0.2)
     ax.grid(axis="y", visible=False)
     _values(ax, "x", column, xlabel, log)
-    ax.set_title(title)
+    figure.suptitle(title, x=0.01, ha="left", weight="bold", fontsize=12)  # of the figure: long names leave the axes little room
     return figure
 
 
