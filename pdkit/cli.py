@@ -109,6 +109,9 @@ def test(argv: list[str]) -> int:
 
     os.chdir(ROOT)
     serial = re.compile(r"-[vqxl]*n|--numprocesses|--pdb|--trace|--capture|-[vqxl]*s[vqxl]*$|(-p)?no:xdist")  # -sv, too
+    lost = [a for a in argv if re.match(r"[^-][^:]*\.py(::|$)", a) and not os.path.exists(a.split("::")[0])]
+    if lost:
+        raise PdkitError(f"There is no test file {lost[0]} in {ROOT}.")
     alone = any(os.path.exists(a.split("::")[0]) or serial.match(a) for a in argv) or not find_spec("xdist")
     workers = min(4, cores())
     return int(pytest.main(argv if alone or workers < 2 else ["-n", str(workers), "--dist", "worksteal", *argv]))

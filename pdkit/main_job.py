@@ -14,12 +14,12 @@ from . import nb, page
 from .cli import Parser
 from .errors import PdkitError
 from .files import ROOT, read_json, runs_root
-from .methods.registry import check_read
+from .methods.registry import base_folder, check_read
 from .online_config import OnlineConfig
 from .plots import Picture
 from .policies import Policy
 from .profiles import PROFILES, online_config, policy_values
-from .runs import Run
+from .runs import Run, kept_so_far
 from .stats import Paired
 
 NOTEBOOK = "05_policy_decorator"
@@ -116,13 +116,15 @@ def main(argv: list[str]) -> int:
     args = parser.parse_args(argv)
     values = _values(args)
     config = configured(values)
+    if not values.get("base"):
+        base_folder("policy_decorator", values["task"])  # an error where the kit has none
     out = Path(args.out).expanduser().resolve() if args.out else _folder(values)
     print(f"{values['task']}, profile {values['profile']}, seed {values['seed']}: {_announcement(config, values, out)}\n"
           f"Results go to {out}\nCtrl-C stops it; the same command goes on from the last checkpoint.", flush=True)
     try:
         result = nb.run_notebook(NOTEBOOK, values, out)
     except KeyboardInterrupt:
-        print(f"\nInterrupted. {_where(out)} {command(values)}{f' --out {args.out}' if args.out else ''}")
+        print(f"\nInterrupted. {kept_so_far(out / TRAINING)} {command(values)}{f' --out {args.out}' if args.out else ''}")
         return 130
     print(*result["summary"], sep="\n")
     return 0
@@ -181,8 +183,3 @@ def _announcement(config: OnlineConfig, values: dict[str, Any], out: Path) -> st
     return f"{config.total_steps:,} environment steps, {time} on 2 cores (this machine has {cores})."
 
 
-def _where(out: Path) -> str:
-    state = out / TRAINING / "checkpoint" / "state.json"
-    if not state.exists():
-        return "Nothing had been saved yet; start again with:"
-    return f"Training is saved up to step {read_json(state)['step']:,}; go on with:"

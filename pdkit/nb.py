@@ -117,13 +117,15 @@ def find_notebook(name: str) -> Path:
     """The notebook called `name`, the only one whose name starts so (`05`), or the one in the file `name` (.ipynb). Raises PdkitError."""
     if str(name).endswith(".ipynb") and Path(name).is_file():
         return Path(name).resolve()
-    known = notebooks()
-    name = str(name).removeprefix("notebooks/").removesuffix(".ipynb")
+    known, given = notebooks(), str(name)
+    name = given.removeprefix("notebooks/").removesuffix(".ipynb")
     if name in known:
         return known[name]
     matches = [key for key in known if name and key.startswith(name)]
     if len(matches) > 1:
         raise PdkitError(f"{name!r} could be any of these notebooks: {', '.join(matches)}; write more of the name.")
+    if not matches and given.endswith(".ipynb"):
+        raise PdkitError(f"There is no notebook {given}, neither a file nor one of the kit's.")
     if not matches:
         raise unknown("notebook", name, known) if known else PdkitError(f"There are no notebooks in {NOTEBOOKS}.")
     return known[matches[0]]

@@ -42,20 +42,20 @@ class Trainer:
 
     def __init__(self, config: OnlineConfig, base: Policy, demos: Demos | None = None, spec: TaskSpec | None = None):
         pick_device(config.device)  # an error where it is not there
+        # A spec of its own is for worlds outside the registry, such as the probes; with start_fraction both become a shorter task.
+        self.spec = horizon_spec(spec or get_task(config.task), config.start_fraction)
+        if base.config["obs_dim"] != self.spec.obs_dim or base.config["act_dim"] != self.spec.act_dim:
+            raise PdkitError(f"This base policy is for {base.config['obs_dim']} observations and {base.config['act_dim']} actions; "
+                             f"{self.spec.name} has {self.spec.obs_dim} and {self.spec.act_dim}: start from one of this task.")
         check_scale(config.decorator, base.config["act_dim"])
         # The factors of alpha hold for each action of a chunk.
         decorator = dataclasses.replace(config.decorator, alpha_scale=config.decorator.alpha_scale * base.chunk)
         self.config, self.base = dataclasses.replace(config, decorator=decorator), base.eval().to(config.device)
-        # A spec of its own is for worlds outside the registry, such as the probes; with start_fraction both become a shorter task.
-        self.spec = horizon_spec(spec or get_task(config.task), config.start_fraction)
         if config.simulator == "physx_cuda":
             require_batched(self.spec)
         if base.chunk != 1 and not self.chunks:
             raise PdkitError(f"{config.method} takes one action at a time, and this {base.kind} policy decides on {base.chunk} at once: "
                              "start from another one, or from the same with chunk=1.")
-        if base.config["obs_dim"] != self.spec.obs_dim or base.config["act_dim"] != self.spec.act_dim:
-            raise PdkitError(f"This base policy is for {base.config['obs_dim']} observations and {base.config['act_dim']} actions; "
-                             f"{self.spec.name} has {self.spec.obs_dim} and {self.spec.act_dim}.")
         if config.features and not self.sees_features:
             raise PdkitError(f"The networks of {config.method} see the observation alone; set features=False.")
         self.sight = Sight(self.base.normalizer, config.normalize_obs, self.spec.name if config.features else "")

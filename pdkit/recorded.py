@@ -213,7 +213,7 @@ def figure(table: pd.DataFrame, curves: pd.DataFrame, task: str = "Door") -> Fig
             right.errorbar(100 * value, y, xerr=[[100 * (value - rate.low)], [100 * (rate.high - value)]], color="k", capsize=3, lw=1)
         if name in ticks:
             right.plot([100 * ticks[name]] * 2, [y - 0.4, y + 0.4], color="0.4", lw=2)
-        right.text(3, y, f"{100 * value:.0f}", va="center", color="white", weight="bold", fontsize=8)
+        right.text(3, y, f"{100 * value:.3g}", va="center", color="white", weight="bold", fontsize=8)
     right.set_yticks(range(len(bars)), [name for name, *_ in reversed(bars)], fontsize=8)
     least, most = int(table.episodes.min()), int(table.episodes.max())
     shown = f"{least if least == most else f'{least} to {most}'} test episodes, {'mean and seeds' if means else '95 % intervals'}"

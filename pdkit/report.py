@@ -18,6 +18,7 @@ from __future__ import annotations
 import re
 import sys
 import textwrap
+import tomllib
 from collections import Counter
 from pathlib import Path
 
@@ -89,8 +90,11 @@ def recorded_tables(folder: Path) -> dict[str, pd.DataFrame]:
 
 def table_problems(name: str, table: pd.DataFrame, folder: Path) -> list[str]:
     """What is wrong with a recorded table, a sentence each."""
-    if "command" not in table or table.command.isna().any():
-        return [f"{name}.csv has rows without the command that makes them again."]
+    if "command" not in table:
+        return [f"{name}.csv has no column of commands that make its rows again."]
+    if table.command.isna().any():
+        line = int(table.command.isna().to_numpy().argmax()) + 2
+        return [f"{name}.csv has a row without the command that makes it again (line {line}); was the file cut off?"]
     if not set(KEYS) <= set(table):
         return []
     found = []
@@ -105,6 +109,17 @@ def table_problems(name: str, table: pd.DataFrame, folder: Path) -> list[str]:
         lost = [key for key in table[KEYS].itertuples(index=False, name=None) if key not in known]
         found += [f"{name}_curves.csv has no curve of {' '.join(map(str, key))}." for key in lost]
     return found
+
+
+def absent_tables(claims: pd.DataFrame, tables: dict[str, pd.DataFrame]) -> list[str]:
+    """A sentence for each recorded table that a verdict rests on by the sweep in its command, and that is not there."""
+    found: dict[str, str] = {}
+    for command in claims.command[claims.verdict != "untested"]:
+        for spec in re.findall(r"data/sweeps/\w+\.toml", command):
+            if (path := DATA / "sweeps" / Path(spec).name).exists():
+                found.setdefault(tomllib.loads(path.read_text()).get("record") or path.stem, spec)
+    return [f"{name}.csv is missing, on which verdicts rest; `pdkit sweep {spec}` makes it." for name, spec in found.items()
+            if name not in tables]
 
 
 def counts(claims: pd.DataFrame) -> dict[str, int]:
@@ -166,7 +181,7 @@ def main(argv: list[str]) -> int:
     if args.update and "main_job" in tables:
         with atomic_file(folder / "all_tasks.png") as temporary:
             save_small(_range(tables), temporary)
-    problems = claim_problems(claims)
+    problems = claim_problems(claims) + absent_tables(claims, tables)
     for name, table in tables.items():
         problems += table_problems(name, table, folder)
     if problems:

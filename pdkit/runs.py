@@ -146,5 +146,13 @@ class Run:
         return load_file(arrays), values
 
 
+def kept_so_far(folder: Path) -> str:
+    """What an interrupted training in `folder` has saved, to be followed by the command that goes on with it."""
+    state = folder / "checkpoint" / "state.json"
+    if not state.exists():
+        return "Nothing had been saved yet; start again with:"
+    return f"Training is saved up to step {read_json(state)['step']:,}; go on with:"
+
+
 def _now() -> str:
     return datetime.now(UTC).isoformat(timespec="seconds")

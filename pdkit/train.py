@@ -36,7 +36,7 @@ from .policies import POLICIES, Policy, load_policy, save_policy
 from .policies.base import read_card
 from .profiles import PROFILES, differences, flat
 from .recorded import record
-from .runs import Run, commits, describe_machine, origin
+from .runs import Run, commits, describe_machine, kept_so_far, origin
 from .seeds import reported_seeds
 from .sweep_spec import check_names
 from .tasks import get_task
@@ -160,7 +160,9 @@ def _decorated(args) -> int:
     if args.pixels and not encoder:
         raise PdkitError(f"There is no visual policy in {base_folder}; train one with `pdkit train base {args.task} --policy mlp --pixels` "
                          "and name its folder with --base.")
-    args.recipe = args.recipe or ("lesson" if args.method == "policy_decorator" else args.method)
+    if not args.recipe:  # names the run's folder, too: runs of two profiles are two runs
+        plain = args.profile if args.method == "policy_decorator" else args.method
+        args.recipe = plain if args.profile == "lesson" or plain == args.profile else f"{plain},profile={args.profile}"
     if args.episodes < 1 or min(args.seeds) < 0:
         raise PdkitError("--episodes must be at least 1 and every seed 0 or more.")
     check_names(args.record, args.recipe)
@@ -176,7 +178,11 @@ def _decorated(args) -> int:
         started_from = origin(card, demos, encoder, object_set(get_task(args.task)))
         if encoder and demos:
             demos = encoded(demos, pictures_of(demos, Progress(demos.num, "drawn")), encoder)
-        row = decorate(config, base, demos, out, args.episodes, started_from, args.tensorboard, encoder)
+        try:
+            row = decorate(config, base, demos, out, args.episodes, started_from, args.tensorboard, encoder)
+        except KeyboardInterrupt:
+            print(f"\nInterrupted. {kept_so_far(out)} the same command.", file=sys.stderr)
+            return 130
         row |= {"recipe": args.recipe, "command": command_of(args, seed), "commit": commits(read_json(out / "manifest.json"))}
         print(", ".join(f"{k} {v}" for k, v in row.items()), flush=True)
         if args.record:

@@ -77,6 +77,11 @@ def test_the_test_verb_runs_pytest_with_one_thread_and_passes_arguments_on(tmp_p
     assert pdkit("test", *plain).returncode == 1
 
 
+def test_a_test_file_that_is_not_there_is_named():
+    done = pdkit("test", "tests/test_nothing.py::test_it")
+    assert done.returncode == 2 and "There is no test file tests/test_nothing.py::test_it in " in done.stderr
+
+
 SHARED = ["--dist", "worksteal"]
 
 

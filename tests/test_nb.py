@@ -97,6 +97,8 @@ def test_a_readers_own_copies_are_not_the_kits_notebooks(folder):
         write(folder / f"{name}.ipynb", FINISH, parameters=SIMPLE)
     assert list(nb.notebooks()) == ["05_a"] and nb.find_notebook("05") == folder / "05_a.ipynb"
     own = nb.find_notebook(str(folder / "mine" / "05_a.ipynb"))
+    with pytest.raises(PdkitError, match="There is no notebook .*mine/06_b.ipynb"):
+        nb.find_notebook(str(folder / "mine" / "06_b.ipynb"))
     assert nb.name_of(own) == "mine/05_a" and nb.default_folder("mine/05_a", {}) != nb.default_folder("05_a", {})
 
 

@@ -314,6 +314,11 @@ def test_novel_objects_lesson(tmp_path, task):
     assert (result["medians"]["novel"] > result["medians"]["source"]) == (task == "TurnFaucet") and 0 <= result["own_success"] <= 1
 
 
+def test_the_main_job_needs_a_base_policy():
+    with pytest.raises(PdkitError, match="comes with the kit for .*Door.*, not for PushChairSource"):
+        main_job.main(["--task", "PushChairSource"])
+
+
 def test_interrupting_the_main_job_tells_how_to_go_on(monkeypatch, tmp_path, capsys):
     def run_notebook(name, values, out):
         raise KeyboardInterrupt

@@ -579,7 +579,7 @@ def test_from_the_command_line(monkeypatch, tmp_path, capsys):
     assert call("train", "decorated", "Door", "--profile", "smoke", "--base", base, "--episodes", "1", "--out", runs, "--set",
                 "total_steps=300", "warmup_steps=120", "eval_every=0", "num_envs=1") == 0
     assert "env_steps 300" in capsys.readouterr().out
-    trained = tmp_path / "t" / "Door-lesson-seed0" / "decorated"
+    trained = tmp_path / "t" / "Door-smoke-seed0" / "decorated"
     assert encoder_of(trained).view == view_of("Door")
     assert call("train", "decorated", "Door", "--pixels", "--base", "data/checkpoints/Door/base") == 2
     assert "no visual policy in data/checkpoints/Door/base" in capsys.readouterr().err

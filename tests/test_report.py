@@ -71,7 +71,7 @@ def test_a_wrong_claim_is_named_and_no_page_written(results, capsys, changes, sa
 
 
 @pytest.mark.parametrize("rows, said", [
-    ([ROW | {"command": None}], "main.csv has rows without the command"),
+    ([ROW | {"command": None}], "main.csv has a row without the command that makes it again (line 2); was the file cut off?"),
     ([ROW, ROW], "main.csv has 1 rows more than once"),
     ([ROW | {"decorated_success": 90.0}], "decorated_success that is no rate"),
     ([ROW | {"base_success": None}], "base_success that is no rate"),
@@ -81,6 +81,17 @@ def test_a_broken_table_is_named(results, capsys, rows, said):
     pd.DataFrame(rows).to_csv(results / "main.csv", index=False)
     code, _, err = call(results, capsys)
     assert code == 1 and said in err and len(err.strip().splitlines()) == 1
+
+
+def test_a_table_on_which_a_verdict_rests_is_missed(results, capsys):
+    claim = TESTED | {"command": "pdkit sweep data/sweeps/calql.toml; pdkit nb 09"}
+    pd.DataFrame([claim, UNTESTED]).to_csv(results / "claims.csv", index=False)
+    (results.parent / "sweeps").mkdir()
+    (results.parent / "sweeps" / "calql.toml").write_text('record = "calql"')
+    code, _, err = call(results, capsys)
+    assert (code, err) == (1, "calql.csv is missing, on which verdicts rest; `pdkit sweep data/sweeps/calql.toml` makes it.\n")
+    pd.DataFrame([ROW]).to_csv(results / "calql.csv", index=False)
+    assert call(results, capsys)[0] == 0
 
 
 def test_a_table_with_other_keys_needs_only_its_commands(results, capsys):

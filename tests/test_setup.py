@@ -97,6 +97,17 @@ def test_a_moved_project_is_set_up_again(project):  # the editable install and t
     assert pd(moved, "run").returncode == 0 and log(moved).count("install") == 2
 
 
+def test_the_environment_of_another_checkout_is_left_alone(project, tmp_path):
+    """A link to it as .venv: installing through it would turn the other's commands to this checkout."""
+    pd(project, "run")
+    other = tmp_path / "other"
+    shutil.copytree(project, other, symlinks=True, ignore=shutil.ignore_patterns(".venv", "log"))
+    (other / ".venv").symlink_to(project / ".venv")
+    refused = pd(other, "run")
+    assert refused.returncode == 2 and f"is the environment of the checkout in {project}; remove this link" in refused.stderr
+    assert pd(project, "run").returncode == 0 and log(project).count("install") == 1
+
+
 def test_a_failed_install_is_one_sentence_never_stamped_and_resumed(project):
     (project / "offline").touch()
     failed = pd(project, "run")

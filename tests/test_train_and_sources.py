@@ -166,8 +166,8 @@ def test_training_from_the_command_line_records_a_row_a_seed(monkeypatch, tmp_pa
     refused = []
     for owner, name, work in ((train.Trainer, "train", train.Trainer.train), (train, "_episodes", train._episodes)):  # each writes files
         def watched(*given, work=work):
-            with pytest.raises(PdkitError, match="Another process is at work in .*Door-lesson-seed0"):
-                with Run.alone(SimpleNamespace(folder=tmp_path / "runs" / "train" / "Door-lesson-seed0")):
+            with pytest.raises(PdkitError, match="Another process is at work in .*Door-smoke-seed0"):
+                with Run.alone(SimpleNamespace(folder=tmp_path / "runs" / "train" / "Door-smoke-seed0")):
                     pass
             refused.append(1)
             return work(*given)
@@ -189,11 +189,34 @@ def test_training_from_the_command_line_records_a_row_a_seed(monkeypatch, tmp_pa
     assert pd.read_csv(tmp_path / "results" / "t.csv").base_success[0] != 0.25
     monkeypatch.setattr(train, "code_checksum", lambda: "edited")  # another task, perhaps: its base policy is tested anew
     assert call(monkeypatch, *words) == 0 and pd.read_csv(tmp_path / "results" / "t.csv").base_success[0] == table.base_success[0]
-    policy = load_decorated(tmp_path / "runs" / "train" / "Door-lesson-seed0" / "decorated")
+    policy = load_decorated(tmp_path / "runs" / "train" / "Door-smoke-seed0" / "decorated")
     base = load_policy(DATA / "checkpoints" / "Door" / "base")
     assert policy.base.state_dict().keys() == base.state_dict().keys()
     with pytest.raises(PdkitError, match="differing: demos, num_demos"):  # the same folder with other demonstrations is another run
         train.main([*words[1:], "--num-demos", "2"])
+
+
+def test_an_interrupted_training_tells_what_is_kept_and_how_to_go_on(monkeypatch, tmp_path, capsys):
+    monkeypatch.setenv("PDKIT_RUNS", str(tmp_path))
+
+    def stop(*given):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(train, "decorate", stop)
+    words = ["train", "decorated", "Door", "--profile", "smoke", "--method", "residual_rl"]
+    assert call(monkeypatch, *words) == 130 and "Nothing had been saved yet; start again with: the same command." in capsys.readouterr().err
+    folder = tmp_path / "train" / "Door-residual_rl,profile=smoke-seed0" / "checkpoint"  # not where the lesson's run is
+    folder.mkdir(parents=True)
+    (folder / "state.json").write_text('{"step": 1200}')
+    assert call(monkeypatch, *words) == 130 and "saved up to step 1,200; go on with: the same command." in capsys.readouterr().err
+
+
+def test_a_base_policy_of_another_task_is_told_before_anything_else(monkeypatch, capsys):
+    other = str(DATA / "checkpoints" / "Door" / "base")
+    assert call(monkeypatch, "train", "decorated", "StackCube", "--base", other) == 2
+    assert "is for 39 observations and 28 actions; StackCube has 55 and 4: start from one of this task." in capsys.readouterr().err
+    for name, told in (("nowhere", "nowhere/policy.json does not exist (looked for in "), (f"{other}/policy.json", "is a file; name the")):
+        assert call(monkeypatch, "train", "decorated", "Door", "--base", name) == 2 and told in capsys.readouterr().err
 
 
 def test_without_a_number_there_are_as_many_demonstrations_as_the_base_policy_saw():
@@ -269,4 +292,4 @@ def test_a_task_of_ones_own_takes_one_entry_in_the_registry(monkeypatch, tmp_pat
     assert call(monkeypatch, "train", "decorated", "Mine", "--base", str(base), "--demos", str(file), "--profile", "smoke",
                 "--episodes", "2", "--out", str(out)) == 0
     assert "task Mine, method policy_decorator" in capsys.readouterr().out
-    assert load_decorated(out / "Mine-lesson-seed0" / "decorated").base.kind == "mlp"
+    assert load_decorated(out / "Mine-smoke-seed0" / "decorated").base.kind == "mlp"

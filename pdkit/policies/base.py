@@ -140,6 +140,11 @@ def share_weights(folder: str | Path, other: str | Path) -> None:
 def read_card(folder: str | Path) -> dict[str, Any]:
     """policy.json of a saved policy. Raises PdkitError when it is missing or not one of ours."""
     folder = Path(folder)
+    if folder.is_file():
+        raise PdkitError(f"{folder} is a file; name the folder that a policy was saved in.")
+    if not (folder / "policy.json").exists():
+        seen = "" if folder.is_absolute() else f" (looked for in {Path.cwd()})"
+        raise PdkitError(f"{folder}/policy.json does not exist{seen}; name the folder that a policy was saved in.")
     card = read_json(folder / "policy.json")
     if not isinstance(card, dict) or card.get("format") != FORMAT:
         raise PdkitError(f"{folder}/policy.json is not a {FORMAT} file; it was written by something else or another version.")
