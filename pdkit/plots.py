@@ -24,6 +24,8 @@ from .stats import Paired, Rate
 
 COLORS = {"base": "#7d7d7d", "decorated": "#1f6fb4", "exploring": "#9cc3e6", "gained": "#2c9f6b", "lost": "#d1495b",
           "both": "#cfe3d8", "neither": "#3c3c46", "gate": "#e0a030", "recorded": "#c9c9c9"}
+PALETTE = ["#1f6fb4", "#d1495b", "#2c9f6b", "#e0a030", "#7a4fa3", "#17a2b8", "#a8542a", "#e377c2", "#5f6b1f", "#3c3c46", "#9cc3e6",
+           "#f4a6a0", "#98cfa9", "#c7b42c", "#5b4a8a", "#00c9a7", "#ff8c42", "#b79be0", "#0b3d2e"]  # enough for a leaderboard
 STYLE = {"font.size": 10, "axes.titlesize": 11, "axes.titleweight": "bold", "axes.titlelocation": "left",
          "axes.spines.right": False, "axes.spines.top": False, "axes.grid": True, "grid.color": "#e8e8e8",
          "axes.axisbelow": True, "legend.frameon": False, "figure.dpi": 110, "savefig.dpi": 130, "lines.linewidth": 1.8,

@@ -9,8 +9,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 
 from .base_analysis import best_of
-from .plots import COLORS, Picture, _columns, _percent, blank, styled
-from .plots_compare import PALETTE
+from .plots import COLORS, PALETTE, Picture, _columns, _percent, blank, styled
 from .stats import Rate
 
 

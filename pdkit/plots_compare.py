@@ -13,11 +13,9 @@ from matplotlib.axes import Axes
 
 from .claims import LEAST_SEEDS
 from .errors import PdkitError
-from .plots import COLORS, Picture, _columns, _percent, blank, styled
+from .plots import COLORS, PALETTE, Picture, _columns, _percent, blank, styled
 from .stats import Interval, iqm, stratified_bootstrap
 
-PALETTE = ["#1f6fb4", "#d1495b", "#2c9f6b", "#e0a030", "#7a4fa3", "#17a2b8", "#a8542a", "#e377c2", "#5f6b1f", "#3c3c46", "#9cc3e6",
-           "#f4a6a0", "#98cfa9", "#c7b42c", "#5b4a8a", "#00c9a7", "#ff8c42", "#b79be0", "#0b3d2e"]  # enough for a leaderboard
 BOOTSTRAP_SEED = 0  # of every interval here: a figure drawn twice is the same
 
 

@@ -9,8 +9,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.patches import Circle
 
-from .plots import COLORS, Picture, blank, styled
-from .plots_compare import PALETTE
+from .plots import COLORS, PALETTE, Picture, blank, styled
 from .probes import ForkSim
 from .stats import Rate, wilson
 
@@ -28,8 +27,11 @@ def fork_figure(ways: Mapping[str, Sequence[np.ndarray]], rates: Mapping[str, Ra
             crashed = np.linalg.norm(path[-1] - ForkSim.CENTRE) < ForkSim.RADIUS
             ax.plot(*path.T, color=COLORS["lost"] if crashed else COLORS["decorated"], lw=1.1, alpha=0.6)
             ax.plot(*path[-1], "x" if crashed else ".", color=COLORS["lost"] if crashed else COLORS["decorated"], ms=5)
-        ax.set(xlim=(-0.2, 2.5), ylim=(-1, 1), aspect="equal", title=name + (f"\n{rates[name].value:.0%} pass" if name in rates else "\n"))
+        ax.set(xlim=(-0.2, 2.5), ylim=(-1, 1), aspect="equal", xlabel="x")
+        ax.set_title(name + (f"\n{rates[name].value:.0%} pass" if name in rates else "\n"))
         ax.grid(visible=False)
+    axes[0, 0].set_ylabel("y")
+    figure.suptitle("paths from left to right: blue passes, red runs into the disc", x=0.01, ha="left", fontsize=9)
     return figure
 
 
@@ -50,7 +52,8 @@ def schedule_figure(alpha_bar: np.ndarray, asked: Mapping[str, Sequence[int]]) -
         ax.text(len(steps) + 1, -0.1 - 0.11 * row, name, va="center", fontsize=8.5, color=PALETTE[row])
     ax.set(xlabel="diffusion step k", ylabel="share", ylim=(-0.15 - 0.11 * len(asked), 1.05), xlim=(-2, len(steps) + 22))
     ax.set_xticks(range(0, len(steps) + 1, 25))
-    ax.legend(loc="center right", fontsize=8.5)
+    ax.set_yticks(np.arange(0, 1.01, 0.25))  # below 0 are the samplers
+    ax.legend(loc="lower center", bbox_to_anchor=(0.45, 1.0), ncols=2, fontsize=8.5)
     return figure
 
 
@@ -70,7 +73,7 @@ def sequences_figure(rows: Mapping[str, tuple[Sequence[int | str], np.ndarray]],
                 ax.plot(sequence[:, d], color=PALETTE[d % len(PALETTE)], lw=1.3)
             ax.set_title(str(label), fontsize=9)
             ax.set(ylim=(-2.6, 2.6))
-        line[0].set_ylabel(name, fontsize=9)
+        line[0].set_ylabel(f"{name}\n(action)", fontsize=9)
     if chunk is not None:
         axes[-1][len(labels) - 1].axvspan(chunk.start - 0.4, chunk.stop - 0.6, color=COLORS["gate"], alpha=0.3, lw=0)
     for ax in axes[-1]:

@@ -8,8 +8,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.patches import FancyArrowPatch, Rectangle
 
-from .plots import COLORS, Picture, _columns, blank, styled
-from .plots_compare import PALETTE
+from .plots import COLORS, PALETTE, Picture, _columns, blank, styled
 
 TUNED = COLORS["decorated"]
 

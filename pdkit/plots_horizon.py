@@ -9,8 +9,8 @@ import pandas as pd
 from matplotlib.axes import Axes
 
 from .horizon_analysis import Progress
-from .plots import COLORS, Picture, _columns, _percent, blank, styled
-from .plots_compare import PALETTE, over_seeds
+from .plots import COLORS, PALETTE, Picture, _columns, _percent, blank, styled
+from .plots_compare import over_seeds
 from .stats import wilson
 
 HORIZON = "horizon: share of the way to success that is left"

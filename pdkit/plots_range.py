@@ -84,7 +84,7 @@ def bounds_figure(table: pd.DataFrame, reached: pd.DataFrame | None = None, titl
     for ax in axes.flat[len(tasks):]:
         ax.set_visible(False)
     for ax in axes.flat[max(0, len(tasks) - axes.shape[1]):len(tasks)]:
-        ax.set_xlabel("alpha")
+        ax.set_xlabel("alpha (logarithmic above the least)")
     figure.supylabel("success within the episode", fontsize=9.5)
     figure.suptitle(title)
     marks = [("o", COLORS["base"], "base, corrected by a demonstrator"), ("D", COLORS["decorated"], "decorated, at its own bound")]

@@ -8,8 +8,8 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 
-from .plots import COLORS, Picture, _columns, _percent, blank, styled
-from .plots_compare import PALETTE, colours, labelled, nth, thousands
+from .plots import COLORS, PALETTE, Picture, _columns, _percent, blank, styled
+from .plots_compare import colours, labelled, nth, thousands
 from .stats import Rate
 
 

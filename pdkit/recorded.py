@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import re
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,13 +15,14 @@ from matplotlib.figure import Figure
 
 from .errors import PdkitError
 from .files import DATA, atomic_file, read_json, write_json
-from .plots import save_small
+from .plots import PALETTE, save_small
 from .runs import describe_machine
 from .stats import wilson
 from .tasks import TASKS
 from .tasks.partnet import object_set
 
 KEYS = ["task", "recipe", "seed"]  # a row with the same ones is replaced
+OTHER_BASE = re.compile(r",base=[^,]*")  # in the recipe of a method that starts from another policy than its own
 OWN = ",partnet"  # behind the recipe of a row on the user's own objects
 
 
@@ -171,7 +173,8 @@ def figure(table: pd.DataFrame, curves: pd.DataFrame, task: str = "Door") -> Fig
     """Left: evaluations on selection seeds during training, a line a run. Right: success on the test seeds, with intervals.
 
     Runs are named by their recipe where there are several recipes, by their seed otherwise; several recipes with several seeds
-    are a line a recipe (the mean), and a bar with a dot a seed, the best on top. Where recipes start from different successes of one
+    are a line a recipe (the mean), and a bar with a dot a seed, the best on top; what starts from another policy (`,base=`) has its
+    method's colour, dashed and hatched. Where recipes start from different successes of one
     kind of policy, which then has no bar of its own, each of their bars has a tick at its start.
     """
     table, curves = table[table.task == task], curves[curves.task == task]
@@ -181,7 +184,7 @@ def figure(table: pd.DataFrame, curves: pd.DataFrame, task: str = "Door") -> Fig
         recipes = list(table.groupby("recipe", sort=False).decorated_success.mean().sort_values(ascending=False, kind="stable").index)
     height = max(4.4 if several else 3.6, 0.22 * (len(recipes) if means else len(table)))
     fig, (left, right) = plt.subplots(1, 2, figsize=(10, height), width_ratios=(3, 2), layout="constrained")
-    colors = plt.get_cmap("tab20" if several else "tab10")
+    methods = list(dict.fromkeys(OTHER_BASE.sub("", recipe) for recipe in recipes))
     groups = [(r, r, table[table.recipe == r]) for r in recipes] if means else \
         [(f"{r.recipe}, seed {r.seed}" if several else f"seed {r.seed}", r.recipe, table.loc[[i]]) for i, r in table.iterrows()]
     kind_of = "policy" if "policy" in table else "task"
@@ -191,11 +194,12 @@ def figure(table: pd.DataFrame, curves: pd.DataFrame, task: str = "Door") -> Fig
     ticks = {name: rows.base_success.mean() for name, _, rows in groups if rows[kind_of].iloc[0] in scattered}
     bars = [(name, [value], "0.65", table.episodes.iloc[0]) for name, value in bases.items()]
     for i, (name, recipe, rows) in enumerate(groups):
-        color = colors(i % colors.N)
+        color = PALETTE[(methods.index(OTHER_BASE.sub("", recipe)) if several else i) % len(PALETTE)]
         curve = curves[(curves.recipe == recipe) & curves.seed.isin(rows.seed)].reindex(columns=["seed", "step", "success_once"]).dropna()
         # Seeds are logged a few steps apart: the n-th evaluations belong together.
         curve = curve.assign(number=curve.groupby("seed").cumcount()).groupby("number")[["step", "success_once"]].mean()
-        left.plot(curve.step / 1000, 100 * curve.success_once, "-o", ms=3, lw=1.2, color=color, label=name)
+        left.plot(curve.step / 1000, 100 * curve.success_once, "--o" if OTHER_BASE.search(recipe) else "-o", ms=3, lw=1.2, color=color,
+                  label=name)
         bars.append((name, list(rows.decorated_success), color if several else "#2c9f6b", rows.episodes.iloc[0]))
     for value in bases.values():
         left.axhline(100 * value, color="0.4", ls="--", lw=1, label="base policy")
@@ -205,7 +209,8 @@ def figure(table: pd.DataFrame, curves: pd.DataFrame, task: str = "Door") -> Fig
         left.legend(fontsize=8, loc="lower right")
     for y, (name, values, color, count) in enumerate(reversed(bars)):
         value = sum(values) / len(values)
-        right.barh(y, 100 * value, color=color)
+        right.barh(y, 100 * value, color=color, hatch="///" if OTHER_BASE.search(name) else "", edgecolor="white", lw=0)
+        right.plot(0, y, "s", ms=6, color=color, clip_on=False)  # bars of 0 have a colour, too
         if means and name not in bases:
             right.plot([100 * v for v in values], [y] * len(values), "k.", ms=4)
         else:
@@ -213,7 +218,7 @@ def figure(table: pd.DataFrame, curves: pd.DataFrame, task: str = "Door") -> Fig
             right.errorbar(100 * value, y, xerr=[[100 * (value - rate.low)], [100 * (rate.high - value)]], color="k", capsize=3, lw=1)
         if name in ticks:
             right.plot([100 * ticks[name]] * 2, [y - 0.4, y + 0.4], color="0.4", lw=2)
-        right.text(3, y, f"{100 * value:.3g}", va="center", color="white", weight="bold", fontsize=8)
+        right.text(104, y, f"{100 * value:.3g}", va="center", fontsize=8)
     right.set_yticks(range(len(bars)), [name for name, *_ in reversed(bars)], fontsize=8)
     least, most = int(table.episodes.min()), int(table.episodes.max())
     shown = f"{least if least == most else f'{least} to {most}'} test episodes, {'mean and seeds' if means else '95 % intervals'}"
