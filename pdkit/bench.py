@@ -20,7 +20,7 @@ from .cli import Parser
 from .decorator import DecoratorConfig, critic_features
 from .demos import Demos
 from .demos.sources import bundled
-from .files import DATA, write_json
+from .files import DATA, check_writable, write_json
 from .gradient_steps import GradientSteps, gradient_step, make_optimizer
 from .imitate import ImitateConfig, Windows, untrained
 from .pixel_analysis import backend, why_not
@@ -274,6 +274,8 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--only", nargs="+", metavar="PART", choices=PARTS, default=PARTS, help=f"some of: {', '.join(PARTS)}")
     parser.add_argument("--quick", action="store_true", help="one short round of each, to see that all of it runs")
     args = parser.parse_args(argv)
+    if args.json:
+        check_writable(args.json)
     set_threads(args.threads)
     device = pick_device(args.device)
     seconds = 0.2 if args.quick else args.seconds

@@ -8,6 +8,7 @@ import hashlib
 import json
 import os
 import shutil
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -100,6 +101,19 @@ def check_replaceable(path: str | Path, *names: str) -> None:
         raise _told(error, path) from error
     if foreign:
         raise PdkitError(f"{path} holds something else (no {' or '.join(sorted(names))}); name another folder, or an empty one.")
+
+
+def check_writable(path: str | Path) -> None:
+    """Raises PdkitError where a file could not be written at `path`: to be asked before long work, not after."""
+    path = Path(os.path.realpath(path))
+    if path.is_dir():
+        raise PdkitError(f"{path} is a folder; name a file in it.")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=path.parent):
+            pass
+    except OSError as error:
+        raise _told(error, path) from error
 
 
 def recover(path: str | Path) -> None:

@@ -17,6 +17,7 @@ from .demos.cli import Progress
 from .diffusion_analysis import resampled
 from .errors import PdkitError, unknown
 from .evaluate import evaluate
+from .files import check_writable
 from .methods.jsrl import CARD, JumpStart, load_jump_start
 from .oracle import by_bound
 from .pixels.encoders import Encoder
@@ -177,6 +178,9 @@ def main(argv: list[str]) -> int:
     if args.film:
         if len(args.tasks) > 1 or encoder_of(args.policy):
             raise PdkitError("--film shows one task and policies that are told the state: name one task, and a policy without an encoder.")
+        if Path(args.film).suffix not in (".mp4", ".webp"):
+            raise PdkitError(f"--film writes .mp4 or .webp, not {args.film}.")
+        check_writable(args.film)
         print(f"wrote {film(policy, get_task(args.tasks[0]), args.film, args.episodes)}")
         return 0
     if args.oracle:

@@ -9,7 +9,7 @@ import pytest
 
 from pdkit import runs
 from pdkit.errors import PdkitError
-from pdkit.files import atomic_folder, check_replaceable, locked, recover
+from pdkit.files import atomic_folder, check_replaceable, check_writable, locked, recover
 
 
 def save(folder, text):
@@ -119,3 +119,12 @@ def test_a_run_that_another_code_resumes_names_both(tmp_path, monkeypatch):
     found["git"] = "three"  # only reads what is finished
     manifest = opened().manifest
     assert runs.commits(manifest) == "one then two" and len(manifest["resumed"]) == 1
+
+
+def test_what_cannot_be_written_is_told_before_the_work(tmp_path):
+    check_writable(tmp_path / "new" / "file.json")
+    assert list((tmp_path / "new").iterdir()) == []
+    (tmp_path / "file").write_text("x")
+    for path, told in ((tmp_path, "is a folder; name a file"), (tmp_path / "file" / "below", "Cannot write .*below")):
+        with pytest.raises(PdkitError, match=told):
+            check_writable(path)

@@ -144,6 +144,8 @@ def test_films_that_cannot_be_made_are_refused_in_a_sentence(tmp_path, capsys, m
     folder = str(DATA / "checkpoints" / "Door" / "base")
     assert cli.main(["evaluate", folder, "--tasks", "reach", "far", "--film", str(tmp_path / "x.mp4")]) == 2
     assert "name one task" in capsys.readouterr().err
+    assert cli.main(["evaluate", folder, "--tasks", "reach", "--film", str(tmp_path / "x.gif")]) == 2
+    assert "writes .mp4 or .webp, not" in capsys.readouterr().err
     monkeypatch.setenv("PDKIT_RENDER", "off")
     assert cli.main(["evaluate", folder, "--tasks", "reach", "--film", str(tmp_path / "x.mp4")]) == 2
     assert "turned off" in capsys.readouterr().err and not list(tmp_path.iterdir())

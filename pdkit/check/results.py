@@ -16,6 +16,9 @@ def ranking(answer: Callable, recorded: Mapping[str, float], strict: bool = Fals
     groups: list[list[str]] = []
 
     def complaints() -> Iterator[str]:
+        if not recorded:
+            yield "nothing is recorded here that could be ranked."
+            return
         groups.extend([entry] if isinstance(entry, str) else list(entry) for entry in answer())
         got = [name for group in groups for name in group]
         if sorted(got) != sorted(recorded):

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..cli import Parser
 from ..errors import PdkitError
-from ..files import DATA, runs_root
+from ..files import DATA, check_writable, runs_root
 from ..seeds import ROLLOUT, TEST
 from ..tasks import TASKS, get_task
 from . import sources
@@ -61,10 +61,7 @@ def main(argv: list[str]) -> int:
     if args.file and source != "hub":
         raise PdkitError("--from names a file of ManiSkill's hub; add --source hub.")
     out = Path(args.out) if args.out else runs_root() / "demos" / f"{args.task}-{source}-{args.num}.safetensors"
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)  # before the work, not after
-    except OSError as error:
-        raise PdkitError(f"Cannot write to {out.parent}: {error.strerror}; choose another --out.") from None
+    check_writable(out)  # before the work, not after
     demos = _make(args, source)
     save_demos(demos, out)
     describe(demos, out)
