@@ -30,8 +30,8 @@ def range_figure(tasks: pd.DataFrame, means: pd.DataFrame, title: str = "", pape
             labels[at] = f"{row.task} ({seeds})"
             if row.seeds:
                 _way(ax, at, row.base, row.decorated)
-                for low, high, color in ((row.base_low, row.base_high, "base"), (row.low, row.high, "decorated")):
-                    ax.plot([low, high], [at, at], color=COLORS[color], lw=5, alpha=0.25, solid_capstyle="butt", zorder=1)
+                for low, high, color, aside in ((row.base_low, row.base_high, "base", -0.09), (row.low, row.high, "decorated", 0.09)):
+                    ax.plot([low, high], [at + aside, at + aside], color=COLORS[color], lw=5, alpha=0.25, solid_capstyle="butt", zorder=1)
         else:
             labels[at] = f"mean, {row.tasks} tasks"
             if np.isfinite(row.decorated):
@@ -47,7 +47,8 @@ def range_figure(tasks: pd.DataFrame, means: pd.DataFrame, title: str = "", pape
     marks = [("o", COLORS["base"], COLORS["base"], "base policy"), ("o", COLORS["decorated"], COLORS["decorated"], "decorated"),
              ("s", "none", "0.3", f"the paper's mean, {paper}")]
     handles = [Line2D([], [], marker=m, ls="", mfc=fill, color=edge, label=label) for m, fill, edge, label in marks]
-    figure.legend(handles=handles, loc="outside lower center", ncols=3, fontsize=8.5)
+    handles.insert(2, Line2D([], [], lw=5, alpha=0.8, color=COLORS["recorded"], solid_capstyle="butt", label="95 % interval"))
+    figure.legend(handles=handles, loc="outside lower center", ncols=4, fontsize=8.5)
     return figure
 
 
