@@ -11,7 +11,7 @@ from .cli import Parser
 from .errors import PdkitError
 from .files import ROOT, locked, runs_root
 from .main_job import duration
-from .sweep_jobs import bases_to_make, finished, make_jobs, missing, unlike_recorded
+from .sweep_jobs import CODE, bases_to_make, code_of, finished, make_jobs, missing, unlike_recorded
 from .sweep_progress import Progress
 from .sweep_ray import Ray, must_be_installed
 from .sweep_run import LOG, Backend, Job, JobFunction, Local, run_job, run_jobs
@@ -38,7 +38,8 @@ def record_results(name: str, jobs: Sequence[Job], command: str) -> int:
 
     results = [(job, result) for job in jobs if (result := finished(job))]
     if results:
-        rows = [result["row"] | job.labels | {"command": job.command, "sweep": command} for job, result in results]
+        rows = [result["row"] | job.labels | {"command": job.command, "sweep": command} | ({CODE: code} if (code := code_of(job)) else {})
+                for job, result in results]
         record(name, pd.DataFrame(rows), pd.DataFrame([point | job.labels for job, result in results for point in result["curve"]]))
     return len(results)
 

@@ -34,6 +34,7 @@ BASE_DEFAULTS = {"policy": "bet", "episodes": 200}  # of the training of a base 
 BASE_OPTIONS = ("task", "policy", "num_demos", "demos", "episodes")
 NUMBERS = ("episodes", "num_demos")  # of all these; the others are words
 RECIPE = re.compile(r"[\w.,=+-]+")
+CHECKED, CODE = "the notebook's code", "notebook_code"  # its checksum, in a job's config; the beginning of it, in a recorded row
 
 
 def make_jobs(spec: Spec) -> list[Job]:
@@ -202,7 +203,7 @@ def _notebook(spec: Spec, cell: dict[str, Any], seed: int) -> Job:
     words = ["nb", name, *(word for k, v in values.items() for word in ("-p", f"{k}={json.dumps(v)}"))]
     labels = {"task": str(values.get("task", stem)), "recipe": recipe, "seed": seed}
     return _job(spec, {"notebook": name, "recipe": recipe} | values, labels, words, like=name, minutes=spec.minutes,
-                config={"the notebook's code": notebook_checksum(path)})
+                config={CHECKED: notebook_checksum(path)})
 
 
 def _job(spec: Spec, parameters: dict[str, Any], labels: dict[str, Any], words: list[str], **others: Any) -> Job:
@@ -231,15 +232,27 @@ def _differing(then: dict[str, Any], job: Job) -> list[str]:
 
 
 def missing(jobs: Sequence[Job], name: str) -> list[Job]:
-    """The jobs without a row in data/results/NAME.csv whose command trains, or runs, the same."""
+    """The jobs without a row in data/results/NAME.csv whose command trains, or runs, the same; a row of a notebook whose code has
+    changed since counts as none (rows that do not tell their code count)."""
     from .recorded import load
 
     try:
         rows = load(name)[0]
     except PdkitError:  # nothing is recorded yet
         return list(jobs)
-    done = set(zip(rows.task, rows.recipe, rows.seed, map(essence, rows.command), strict=True))
-    return [job for job in jobs if (*(job.labels[key] for key in ("task", "recipe", "seed")), essence(job.command)) not in done]
+    codes = rows[CODE].fillna("") if CODE in rows else [""] * len(rows)
+    done = dict(zip(zip(rows.task, rows.recipe, rows.seed, map(essence, rows.command), strict=True), codes, strict=True))
+
+    def there(job: Job) -> bool:
+        key = (*(job.labels[name] for name in ("task", "recipe", "seed")), essence(job.command))
+        return key in done and done[key] in ("", code_of(job))
+
+    return [job for job in jobs if not there(job)]
+
+
+def code_of(job: Job) -> str:
+    """Which code a job's notebook has, as the column CODE of its row tells; empty for a training."""
+    return job.config.get(CHECKED, "")[:12]
 
 
 def essence(command: str) -> tuple[str, ...]:

@@ -447,6 +447,16 @@ def test_missing_leaves_out_what_is_recorded_by_the_same_command_alone(tmp_path,
     assert started == [second] and len(pd.read_csv(results / "tiny.csv")) == 2
 
 
+def test_rows_of_a_notebook_whose_code_has_changed_since_are_missing(tmp_path, results):
+    job, = sweep_jobs.make_jobs(load_spec(written(tmp_path, **BOOK | {"grid": None,
+                                                              "cells": [{"recipe": "a"}], "seeds": [0]})))
+    row = job.labels | {"command": job.command}
+    for code, gone in ((sweep_jobs.code_of(job), []), ("0123456789ab", [job]), (None, [])):
+        recorded.record("nbs", pd.DataFrame([row | {sweep_jobs.CODE: code}]), pd.DataFrame())
+        assert sweep_jobs.missing([job], "nbs") == gone
+    assert len(sweep_jobs.code_of(job)) == 12
+
+
 @pytest.mark.parametrize("other, same", [
     ("pdkit train decorated Door --seeds 1 --method policy_decorator --threads 1 --set env_workers=0 utd=1 alpha=0.1 --record x", True),
     ("pdkit train decorated Door --seeds 1 --set utd=1 alpha=0.2", False),
