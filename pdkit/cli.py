@@ -109,7 +109,8 @@ def test(argv: list[str]) -> int:
 
     os.chdir(ROOT)
     serial = re.compile(r"-[vqxl]*n|--numprocesses|--pdb|--trace|--capture|-[vqxl]*s[vqxl]*$|(-p)?no:xdist")  # -sv, too
-    lost = [a for a in argv if re.match(r"[^-][^:]*\.py(::|$)", a) and not os.path.exists(a.split("::")[0])]
+    paths = [a for before, a in zip(["", *argv], argv, strict=False) if re.match(r"[^-=*?\s][^:=*?\s]*\.py(::|$)", a) and before[:1] != "-"]
+    lost = [a for a in paths if not os.path.exists(a.split("::")[0])]
     if lost:
         raise PdkitError(f"There is no test file {lost[0]} in {ROOT}.")
     alone = any(os.path.exists(a.split("::")[0]) or serial.match(a) for a in argv) or not find_spec("xdist")

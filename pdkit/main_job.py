@@ -181,5 +181,3 @@ def _announcement(config: OnlineConfig, values: dict[str, Any], out: Path) -> st
     time = duration(expected_minutes(config, reported_episodes(values)))
     cores = os.cpu_count() or 1
     return f"{config.total_steps:,} environment steps, {time} on 2 cores (this machine has {cores})."
-
-

@@ -11,7 +11,7 @@ from .cli import Parser
 from .errors import PdkitError
 from .files import ROOT, locked, runs_root
 from .main_job import duration
-from .sweep_jobs import CODE, bases_to_make, code_of, finished, make_jobs, missing, unlike_recorded
+from .sweep_jobs import CODE, bases_to_make, changed, code_of, finished, make_jobs, missing, unlike_recorded
 from .sweep_progress import Progress
 from .sweep_ray import Ray, must_be_installed
 from .sweep_run import LOG, Backend, Job, JobFunction, Local, run_job, run_jobs
@@ -87,7 +87,8 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--record", metavar="NAME", help="add the finished rows to data/results/NAME.csv (default: the spec's `record`)")
     parser.add_argument("--seeds", type=int, nargs="+", metavar="SEED", help="only these of the spec's seeds")
     parser.add_argument("--recipes", nargs="+", metavar="RECIPE", help="only these of its cells, by their recipe (--dry-run shows them)")
-    parser.add_argument("--missing", action="store_true", help="leave out what data/results has already, from whichever machine")
+    parser.add_argument("--missing", action="store_true", help="leave out what data/results has already, from whichever machine "
+                        "(not rows of a notebook whose code has changed since)")
     parser.add_argument("--dry-run", action="store_true", help="list the jobs and run nothing")
     args = parser.parse_args(argv)
     if args.workers is not None and args.workers < 1:
@@ -104,6 +105,9 @@ def main(argv: list[str]) -> int:
         jobs = [job for job in jobs if not wanted or job.labels[label] in wanted]
     if args.missing:
         jobs = missing(jobs, name)
+    if len(old := changed(jobs)) > 1:
+        raise PdkitError(f"{len(old)} jobs were finished with other values than their methods and profiles, or notebooks, now give; delete "
+                         f"these folders to run them again: {' '.join(shlex.quote(str(job.folder)) for job in old)}")
     bases = bases_to_make(spec, jobs)
     if args.dry_run:
         print(*map(_listing, [*bases, *jobs]), sep="\n")

@@ -225,6 +225,11 @@ def finished(job: Job) -> dict[str, Any] | None:
     return result
 
 
+def changed(jobs: Sequence[Job]) -> list[Job]:
+    """Those that were finished with settings that their profiles, or notebooks, no longer have: `finished` refuses each."""
+    return [job for job in jobs if job.result.exists() and _differing(read_json(job.result).get("settings", {}), job)]
+
+
 def _differing(then: dict[str, Any], job: Job) -> list[str]:
     """The settings, of those that matter, in which what was run differs from the job as it is now."""
     now = json.loads(json.dumps(job.config))
@@ -252,7 +257,8 @@ def missing(jobs: Sequence[Job], name: str) -> list[Job]:
 
 def code_of(job: Job) -> str:
     """Which code a job's notebook has, as the column CODE of its row tells; empty for a training."""
-    return job.config.get(CHECKED, "")[:12]
+    code = job.config.get(CHECKED, "")
+    return code and f"c{code[:12]}"  # with a letter: digits alone would be read from the table as a number
 
 
 def essence(command: str) -> tuple[str, ...]:

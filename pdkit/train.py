@@ -69,7 +69,8 @@ def main(argv: list[str]) -> int:
     decorated.add_argument("--episodes", type=int, default=200, help="test episodes (default 200)")
     decorated.add_argument("--out", help="folder of the runs (default runs/train)")
     decorated.add_argument("--record", help="name under data/results: rows are added to NAME.csv and NAME_curves.csv")
-    decorated.add_argument("--recipe", help="what to call this configuration in the record (default: lesson, or the method)")
+    decorated.add_argument("--recipe", help="what to call this configuration in the record, and the run's folder (default: the profile's "
+                                            "name, or the method's)")
     decorated.add_argument("--pixels", action="store_true", help="start from the shipped visual policy (--base may name another)")
     decorated.add_argument("--tensorboard", action="store_true", help="also write event files to the folder of each run")
     for one in (base, decorated):

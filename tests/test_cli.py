@@ -90,6 +90,7 @@ SHARED = ["--dist", "worksteal"]
     (1, [], []), (2, ["tests/test_cli.py::test_lab"], []), (2, ["-n", "0"], []), (2, ["--pdb"], []),
     (2, ["-s"], []), (2, ["-vs"], []), (2, ["-sv"], []), (2, ["-vn0"], []),
     (2, ["--capture", "no"], []), (2, ["-p", "no:xdist"], []), (2, ["-pno:xdist"], []),
+    (2, ["-k", "test_x.py"], ["-n", "2", *SHARED]), (2, ["-o", "python_files=check_*.py"], ["-n", "2", *SHARED]),
     (2, ["-v"], ["-n", "2", *SHARED]), (2, ["-rs"], ["-n", "2", *SHARED]),
 ])
 def test_all_tests_share_the_cores_and_those_of_a_path_do_not(monkeypatch, cores, argv, before):

@@ -250,6 +250,20 @@ def test_where_evaluations_run_does_not_matter(tmp_path):
     assert rows == other_rows and all(torch.equal(actor[k], other_actor[k]) for k in actor)
 
 
+def test_an_evaluation_in_this_process_rounds_as_in_another(monkeypatch):
+    """With one thread, however many training has."""
+    threads = torch.get_num_threads()
+    monkeypatch.setattr("pdkit.online_eval.selection_scores",
+                        lambda *_: {"success_once": float(torch.get_num_threads()), "success_at_end": 0.0})
+    try:
+        torch.set_num_threads(2)
+        trainer = Trainer(config(), biased_base(), spec=SPEC)
+        trainer.train()
+        assert [row["success_once"] for row in trainer.rows if "success_once" in row] == [1.0, 1.0] and torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(threads)
+
+
 def test_an_evaluation_that_was_not_back_at_a_checkpoint_is_made_after_resuming(tmp_path):
     c = config(eval_every=100, checkpoint_every=100)
     run = Run(tmp_path, "online", flat(c))
