@@ -10,6 +10,11 @@ def cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
+def load_average() -> float:
+    """How many processes wanted a processor in the last minute, on average; those of this run among them."""
+    return os.getloadavg()[0]
+
+
 def cpu_has_bf16() -> bool:
     """Whether the CPU multiplies bfloat16 matrices itself, as Linux tells; False where it does not tell (a Mac)."""
     try:

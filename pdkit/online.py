@@ -20,6 +20,7 @@ from .decorated import Decorated, flat_actions, save_decorated
 from .decorator import check_scale, compose, gate, gate_probability, scaled
 from .demos.format import Demos
 from .errors import PdkitError
+from .machine import load_average
 from .online_config import OnlineConfig, decision_reward, lr_factor, stops
 from .online_eval import Evaluations
 from .online_rows import demo_rows, last_observation
@@ -75,6 +76,7 @@ class Trainer:
         self.step, self.train_seconds, self.rows, self.recent = 0, 0.0, [], []
         self.sizes = np.zeros(3)  # since the last row: sums over decisions of |residual|, of |base action|, and their number
         self.first_reward = 0  # the step by which the first reward came; 0: none yet
+        self.loads = np.zeros(2)  # the machine's load average at each row: their sum, and their number
         self.episode_counts = [0] * config.num_envs
         self.log: dict[str, torch.Tensor] = {}
         self.best_score, self.best_actor = -1.0, {}  # of the evaluations so far
@@ -277,6 +279,7 @@ class Trainer:
 
     def _add_row(self, before: int, evaluations: Evaluations) -> None:
         self.rows.append(self._row())
+        self.loads += load_average(), 1
         if self._crossed(before, self.config.eval_every) and self.config.eval_episodes:
             evaluations.submit(self.step, self._actor.state_dict())
 
@@ -328,7 +331,8 @@ class Trainer:
         arrays |= {f"unscored.{step}/{k}": v.numpy() for step, weights in unscored.items() for k, v in weights.items()}
         values = {"step": self.step, "train_seconds": self.train_seconds, "position": self.replay.position, "rows": self.rows,
                   "best_score": self.best_score, "rng": self.rng.bit_generator.state, "recent": [vars(e) for e in self.recent],
-                  "sizes": self.sizes.tolist(), "first_reward": self.first_reward, "log": {k: float(v) for k, v in self.log.items()}}
+                  "sizes": self.sizes.tolist(), "first_reward": self.first_reward, "loads": self.loads.tolist(),
+                  "log": {k: float(v) for k, v in self.log.items()}}
         run.save_checkpoint(arrays, values)
 
     def load(self, run: Run) -> dict[str, np.ndarray]:
@@ -352,6 +356,7 @@ class Trainer:
         self.step, self.train_seconds, self.rows = values["step"], values["train_seconds"], values["rows"]
         self.recent = [Episode(**e) for e in values["recent"]]
         self.sizes, self.first_reward = np.array(values["sizes"]), values["first_reward"]
+        self.loads = np.array(values.get("loads", (0.0, 0.0)))  # a checkpoint of before has none
         self.log = {k: torch.tensor(v) for k, v in values["log"].items()}
         self.best_score, self.best_actor = values["best_score"], {k: torch.from_numpy(v) for k, v in group("best").items()}
         for key, tensor in group("unscored").items():

@@ -5,7 +5,6 @@ import ast
 import hashlib
 import json
 import math
-import os
 import shlex
 import sys
 from dataclasses import asdict
@@ -22,6 +21,7 @@ from .errors import PdkitError
 from .evaluate import evaluate
 from .files import DATA, atomic_file, atomic_folder, check_replaceable, code_checksum, read_json, runs_root, write_json
 from .imitate import configured, imitate
+from .machine import load_average
 from .methods import METHODS
 from .methods.registry import base_folder as shipped_base
 from .methods.registry import make_trainer, method_config, trainer_of
@@ -226,7 +226,7 @@ def decorate(config, base: Policy, demos: Demos | None, out: Path, episodes: int
                    env_steps=trainer.step, first_reward_step=trainer.first_reward or None,
                    updates=trainer.agent.updates, episodes=episodes,
                    **_outcome("base", tables["base"]), **_outcome("decorated", tables["decorated"]),
-                   load_average=round(os.getloadavg()[0], 1) if hasattr(os, "getloadavg") else None)
+                   load_average=round(float(trainer.loads[0] / trainer.loads[1]) if trainer.loads[1] else load_average(), 1))
         run.finish(**row)
     return row
 

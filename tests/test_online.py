@@ -250,6 +250,24 @@ def test_where_evaluations_run_does_not_matter(tmp_path):
     assert rows == other_rows and all(torch.equal(actor[k], other_actor[k]) for k in actor)
 
 
+def test_the_load_beside_a_run_is_that_of_all_of_it(monkeypatch, tmp_path):
+    """Also where it was interrupted: the work of the first hour slowed it all the same."""
+    loads = iter([6.0, 2.0, 6.0, 2.0, 6.0, 2.0])
+    monkeypatch.setattr("pdkit.online.load_average", lambda: next(loads))
+    c = config(eval_every=0, checkpoint_every=200)
+
+    def killed(t):
+        if t.step >= 280:
+            raise KeyboardInterrupt
+
+    run = Run(tmp_path, "online", flat(c))
+    with pytest.raises(KeyboardInterrupt):
+        Trainer(c, biased_base(), spec=SPEC).train(run, killed)
+    resumed = Trainer(c, biased_base(), spec=SPEC)
+    resumed.train(run)
+    assert len(resumed.rows) == resumed.loads[1] == 4 and resumed.loads[0] == 6 + 2 + 2 + 6  # rows at 100 and 200, and at 300 and 400 again
+
+
 def test_an_evaluation_in_this_process_rounds_as_in_another(monkeypatch):
     """With one thread, however many training has."""
     threads = torch.get_num_threads()
@@ -257,9 +275,10 @@ def test_an_evaluation_in_this_process_rounds_as_in_another(monkeypatch):
                         lambda *_: {"success_once": float(torch.get_num_threads()), "success_at_end": 0.0})
     try:
         torch.set_num_threads(2)
-        trainer = Trainer(config(), biased_base(), spec=SPEC)
-        trainer.train()
-        assert [row["success_once"] for row in trainer.rows if "success_once" in row] == [1.0, 1.0] and torch.get_num_threads() == 2
+        made = Trainer(config(), biased_base(), spec=SPEC)._evaluations()
+        made.submit(100, made._arguments[2].state_dict())
+        (_, _, row), = made.collect()
+        assert row["success_once"] == 1.0 and torch.get_num_threads() == 2
     finally:
         torch.set_num_threads(threads)
 
