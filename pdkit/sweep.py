@@ -11,7 +11,7 @@ from .cli import Parser
 from .errors import PdkitError
 from .files import ROOT, locked, runs_root
 from .main_job import duration
-from .sweep_jobs import CODE, bases_to_make, changed, code_of, finished, make_jobs, missing, unlike_recorded
+from .sweep_jobs import CODE, bases_to_make, code_of, finished, make_jobs, missing, outdated, unlike_recorded
 from .sweep_progress import Progress
 from .sweep_ray import Ray, must_be_installed
 from .sweep_run import LOG, Backend, Job, JobFunction, Local, run_job, run_jobs
@@ -105,7 +105,7 @@ def main(argv: list[str]) -> int:
         jobs = [job for job in jobs if not wanted or job.labels[label] in wanted]
     if args.missing:
         jobs = missing(jobs, name)
-    if len(old := changed(jobs)) > 1:
+    if len(old := outdated(jobs)) > 1:
         raise PdkitError(f"{len(old)} jobs were finished with other values than their methods and profiles, or notebooks, now give; delete "
                          f"these folders to run them again: {' '.join(shlex.quote(str(job.folder)) for job in old)}")
     bases = bases_to_make(spec, jobs)

@@ -225,7 +225,7 @@ def finished(job: Job) -> dict[str, Any] | None:
     return result
 
 
-def changed(jobs: Sequence[Job]) -> list[Job]:
+def outdated(jobs: Sequence[Job]) -> list[Job]:
     """Those that were finished with settings that their profiles, or notebooks, no longer have: `finished` refuses each."""
     return [job for job in jobs if job.result.exists() and _differing(read_json(job.result).get("settings", {}), job)]
 

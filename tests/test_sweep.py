@@ -448,8 +448,7 @@ def test_missing_leaves_out_what_is_recorded_by_the_same_command_alone(tmp_path,
 
 
 def test_rows_of_a_notebook_whose_code_has_changed_since_are_missing(tmp_path, results):
-    job, = sweep_jobs.make_jobs(load_spec(written(tmp_path, **BOOK | {"grid": None,
-                                                              "cells": [{"recipe": "a"}], "seeds": [0]})))
+    job, = sweep_jobs.make_jobs(load_spec(written(tmp_path, **BOOK | {"grid": None, "cells": [{"recipe": "a"}], "seeds": [0]})))
     row = job.labels | {"command": job.command}
     for code, gone in ((sweep_jobs.code_of(job), []), ("0123456789ab", [job]), (None, [])):
         recorded.record("nbs", pd.DataFrame([row | {sweep_jobs.CODE: code}]), pd.DataFrame())
