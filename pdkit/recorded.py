@@ -29,6 +29,8 @@ OWN = ",partnet"  # behind the recipe of a row on the user's own objects
 def record(name: str, rows: pd.DataFrame, curves: pd.DataFrame) -> None:
     """Add rows to data/results/NAME.csv and, where there are curves, NAME_curves.csv, and draw a picture a task of trainings.
 
+    Numbers keep six significant digits, those of curves four: more than is drawn, and the repository stays small.
+
     The manifest tells how to make all of it again (the column `sweep` of rows that have one, else `command`) and which machines have
     recorded here, this one last; a row's `cores` hint at which of them made it, and its `commit` is that of its own run. On the user's
     own objects (PDKIT_PARTNET) a recipe is written as RECIPE,partnet, beside those of generated ones; `load` gives the rows of the
@@ -38,12 +40,12 @@ def record(name: str, rows: pd.DataFrame, curves: pd.DataFrame) -> None:
     rows, curves = (table.assign(recipe=table.recipe.where(~_on_own_objects(table), table.recipe + OWN)) if len(table) else table
                     for table in (rows, curves))
     with _alone():
-        for path, new in ((folder / f"{name}.csv", rows), (folder / f"{name}_curves.csv", curves)):
+        for path, new, digits in ((folder / f"{name}.csv", rows, 6), (folder / f"{name}_curves.csv", curves, 4)):
             if new.empty:
                 continue
             tables.append(_merged(path, new))
             with atomic_file(path) as temporary:
-                _whole(tables[-1]).to_csv(temporary, index=False, float_format="%.6g")
+                _whole(tables[-1]).to_csv(temporary, index=False, float_format=f"%.{digits}g")
         again = tables[0]["sweep"].fillna(tables[0].command) if "sweep" in tables[0] else tables[0].command
         path = folder / f"{name}_manifest.json"
         write_json(path, {"written": time.strftime("%Y-%m-%d"), "machines": _machines(path), "again": sorted(set(again))})
