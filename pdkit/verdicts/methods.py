@@ -258,8 +258,10 @@ def _() -> Finding:
     told += "".join(f"; not counted: {recipe} {signed(drop.value)} ({' '.join(each.index.unique('task'))}, {len(each)} runs)"
                     for recipe, (drop, each) in others.items())
     every = pd.concat([each for _, each in drops.values()])  # tasks, seeds and commands of all of them
-    return finding("leaderboard", every, f"{len(fallen)} of {len(drops)} methods fall; points at the first evaluation against the start: "
-                   f"{told}", f"{middle} (the middle one): {points(interval)}",
+    shares = evaluations(curves, middle).groupby(["task", "seed"]).step.agg(["first", "last"])
+    when = f"the first evaluation, after {percent((shares['first'] / shares['last']).mean())} of the steps,"
+    return finding("leaderboard", every, f"{len(fallen)} of {len(drops)} methods fall; points at {when} against the start: {told}",
+                   f"{middle} (the middle one): {points(interval)}",
                    "reproduced" if len(fallen) > max(1, len(drops) / 2) else "partly" if fallen else "not", recipes=list(drops))
 
 
