@@ -4,6 +4,7 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import re
+import shlex
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,12 +17,14 @@ from matplotlib.figure import Figure
 from .errors import PdkitError
 from .files import DATA, atomic_file, read_json, write_json
 from .plots import PALETTE, save_small
-from .runs import describe_machine
+from .runs import NO_MATTER, describe_machine
 from .stats import wilson
 from .tasks import TASKS
 from .tasks.partnet import object_set
 
 KEYS = ["task", "recipe", "seed"]  # a row with the same ones is replaced
+TRAINING = "pdkit train decorated"  # how a command that makes a row of a training begins
+SETTINGS = "settings"  # the column that tells rows of other settings apart: the beginning of a checksum (sweep_run.Job.settings)
 OTHER_BASE = re.compile(r",base=[^,]*")  # in the recipe of a method that starts from another policy than its own
 OWN = ",partnet"  # behind the recipe of a row on the user's own objects
 
@@ -44,6 +47,8 @@ def record(name: str, rows: pd.DataFrame, curves: pd.DataFrame) -> None:
             if new.empty:
                 continue
             tables.append(_merged(path, new))
+            if not tables[1:]:
+                print(*(f"{sentence}\n" for sentence in mixed(name, tables[0])), sep="", end="", flush=True)
             with atomic_file(path) as temporary:
                 _whole(tables[-1]).to_csv(temporary, index=False, float_format=f"%.{digits}g")
         again = tables[0]["sweep"].fillna(tables[0].command) if "sweep" in tables[0] else tables[0].command
@@ -60,6 +65,33 @@ def picture_of(name: str, task: str, table: pd.DataFrame) -> str:
     """What the picture of a task is called: NAME of Door, or of the first task where Door is none of them, NAME-TASK of the others."""
     first = "Door" if "Door" in set(table.task) else table.task.iloc[0]
     return name if task == first else f"{name}-{task}"
+
+
+def mixed(name: str, table: pd.DataFrame) -> list[str]:
+    """A sentence for each recipe of the table NAME whose rows, seeds aside, were not made alike: no mean over them says anything."""
+    def made(command: str) -> str:
+        return str([part for part in essence(command) if not part.startswith("seeds ")])
+
+    decorated = table[table.command.str.startswith(TRAINING)]
+    alike = [decorated.assign(made=decorated.command.map(made))]
+    alike += [table[table[SETTINGS].notna()].assign(made=lambda rows: rows[SETTINGS])] if SETTINGS in table else []
+    found = dict.fromkeys(key for rows in alike for key, ways in rows.groupby(["task", "recipe"]).made if ways.nunique() > 1)
+    return [f"{name}.csv: the rows of {task} {recipe} were run with different settings; run the older ones again "
+            "(`pdkit sweep SPEC --missing` tells which), or record under another name." for task, recipe in found]
+
+
+def essence(command: str) -> tuple[str, ...]:
+    """The parts of a command on which its row depends, sorted; a command other than `pdkit train decorated` counts as it stands."""
+    head, *options = command.split(" --")
+    if not head.startswith(TRAINING):
+        return (command,)
+    parts = {head}
+    for name, _, value in (option.partition(" ") for option in options):
+        if name == "set":
+            parts |= {f"set {word}" for word in shlex.split(value) if word.partition("=")[0] not in NO_MATTER}
+        elif name not in ("record", "threads") and (name, value) != ("method", "policy_decorator"):  # the usual one
+            parts.add(f"{name} {value}")
+    return tuple(sorted(parts))
 
 
 def _on_own_objects(table: pd.DataFrame) -> pd.Series:

@@ -11,7 +11,7 @@ from .cli import Parser
 from .errors import PdkitError
 from .files import ROOT, locked, runs_root
 from .main_job import duration
-from .sweep_jobs import CODE, bases_to_make, code_of, finished, make_jobs, missing, outdated, unlike_recorded
+from .sweep_jobs import bases_to_make, finished, make_jobs, missing, outdated, unlike_recorded
 from .sweep_progress import Progress
 from .sweep_ray import Ray, must_be_installed
 from .sweep_run import LOG, Backend, Job, JobFunction, Local, run_job, run_jobs
@@ -34,12 +34,11 @@ def record_results(name: str, jobs: Sequence[Job], command: str) -> int:
     """Merge the finished jobs' rows and curves into data/results; returns how many."""
     import pandas as pd
 
-    from .recorded import record
+    from .recorded import SETTINGS, record
 
     results = [(job, result) for job in jobs if (result := finished(job))]
     if results:
-        rows = [result["row"] | job.labels | {"command": job.command, "sweep": command} | ({CODE: code} if (code := code_of(job)) else {})
-                for job, result in results]
+        rows = [result["row"] | job.labels | {"command": job.command, "sweep": command, SETTINGS: job.settings} for job, result in results]
         record(name, pd.DataFrame(rows), pd.DataFrame([point | job.labels for job, result in results for point in result["curve"]]))
     return len(results)
 
@@ -88,7 +87,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--seeds", type=int, nargs="+", metavar="SEED", help="only these of the spec's seeds")
     parser.add_argument("--recipes", nargs="+", metavar="RECIPE", help="only these of its cells, by their recipe (--dry-run shows them)")
     parser.add_argument("--missing", action="store_true", help="leave out what data/results has already, from whichever machine "
-                        "(not rows of a notebook whose code has changed since)")
+                        "(not rows whose profile, base policy or notebook has changed since)")
     parser.add_argument("--dry-run", action="store_true", help="list the jobs and run nothing")
     args = parser.parse_args(argv)
     if args.workers is not None and args.workers < 1:

@@ -5,7 +5,6 @@ import contextlib
 import hashlib
 import json
 import re
-import shlex
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from typing import Any
@@ -17,11 +16,12 @@ from .files import ROOT, read_json, runs_root
 from .imitate import ImitateConfig, configured, untrained
 from .main_job import evaluation_minutes, expected_minutes
 from .methods.registry import base_folder, method_config, trainer_of
-from .nb_cells import notebook_checksum
+from .nb_cells import notebook_checksum, parameters_of
+from .online_config import OnlineConfig
 from .policies import Policy, load_policy
 from .policies.base import read_card
 from .profiles import flat
-from .recorded import load
+from .recorded import SETTINGS, essence, load
 from .runs import NO_MATTER
 from .sweep_run import Job, base_settings
 from .sweep_spec import Spec
@@ -34,7 +34,7 @@ BASE_DEFAULTS = {"policy": "bet", "episodes": 200}  # of the training of a base 
 BASE_OPTIONS = ("task", "policy", "num_demos", "demos", "episodes")
 NUMBERS = ("episodes", "num_demos")  # of all these; the others are words
 RECIPE = re.compile(r"[\w.,=+-]+")
-CHECKED, CODE = "the notebook's code", "notebook_code"  # its checksum, in a job's config; the beginning of it, in a recorded row
+UNTIED = {*NO_MATTER, "threads", "pictures", "strict"}  # what a row's settings do not tell, as its numbers do not depend on it
 
 
 def make_jobs(spec: Spec) -> list[Job]:
@@ -86,7 +86,7 @@ def _training(spec: Spec, cell: dict[str, Any], seed: int) -> Job:
             given |= {"demos": demos.checksum, "num_demos": demos.num}
     words = ["train", "decorated", *_options(OPTIONS, cell), "--seeds", str(seed), *_set(settings)]
     return _job(spec, cell | {"seed": seed}, {"task": cell["task"], "recipe": cell["recipe"], "seed": seed}, words, like=cell["method"],
-                config=flat(config) | given,
+                config=flat(config) | given, usual=flat(OnlineConfig()) | (given if cell.get("base") in spec.bases else {}),
                 minutes=spec.minutes or expected_minutes(config, cell["episodes"]))
 
 
@@ -169,7 +169,7 @@ def _imitation(spec: Spec, cell: dict[str, Any], seed: int) -> Job:
     demos = demos.first(cell.get("num_demos", demos.num))
     words = ["train", "base", *_options(BASE_OPTIONS, cell), *_set(settings)]
     return _job(spec, cell | {"seed": seed}, {"task": cell["task"], "recipe": cell["recipe"], "seed": seed}, words,
-                like=f"{cell['task']} {cell['policy']}", minutes=spec.minutes,
+                like=f"{cell['task']} {cell['policy']}", minutes=spec.minutes, usual=asdict(ImitateConfig()) | policy.defaults,
                 config={"policy": policy.kind, "demos_checksum": demos.checksum} | asdict(config)
                 | {name: value for name, value in policy.config.items() if name not in policy.made})
 
@@ -199,19 +199,27 @@ def _notebook(spec: Spec, cell: dict[str, Any], seed: int) -> Job:
         raise PdkitError(f"{spec.path.name}: a notebook sweep needs notebook = \"05\" (or another one) in fixed.")
     path, recipe = nb.find_notebook(name), cell.pop("recipe")
     name, stem = nb.name_of(path), path.stem
-    values = nb.checked_parameters(name, cell | {"seed": seed})
+    if "seed" not in (known := parameters_of(path)) and seed:
+        raise PdkitError(f"{spec.path.name}: the notebook {stem} has no parameter `seed`; leave seeds out, and it runs once a cell.")
+    values = nb.checked_parameters(name, cell | ({"seed": seed} if "seed" in known else {}))
     words = ["nb", name, *(word for k, v in values.items() for word in ("-p", f"{k}={json.dumps(v)}"))]
     labels = {"task": str(values.get("task", stem)), "recipe": recipe, "seed": seed}
     return _job(spec, {"notebook": name, "recipe": recipe} | values, labels, words, like=name, minutes=spec.minutes,
-                config={CHECKED: notebook_checksum(path)})
+                config={"the notebook's code": notebook_checksum(path)}
+                | {p.name: p.default for p in known.values() if p.name not in ("out", *UNTIED)} | values)
 
 
-def _job(spec: Spec, parameters: dict[str, Any], labels: dict[str, Any], words: list[str], **others: Any) -> Job:
+def _job(spec: Spec, parameters: dict[str, Any], labels: dict[str, Any], words: list[str], config: dict[str, Any],
+         usual: dict[str, Any] | None = None, **others: Any) -> Job:
+    """`usual` holds the values of `config` that a row's settings leave out: those of a new field that changes nothing by itself, and the
+    weights of a base policy that each machine makes for itself."""
     objects = object_set(TASKS[labels["task"]]) if labels["task"] in TASKS else ""
     marks = parameters | ({"objects": objects} if objects else {})  # what was run on other objects is another job
+    told = {k: v for k, v in config.items() if k not in (*UNTIED, "seed") and (usual is None or k not in usual or usual[k] != v)}
+    settings = hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()[:12]
     key = hashlib.sha256(json.dumps(marks, sort_keys=True).encode()).hexdigest()[:10]
     folder = runs_root() / "sweeps" / spec.name / f"{labels['task']}-{labels['recipe']}-seed{labels['seed']}-{key}"
-    return Job(spec.kind, labels, tuple(words), folder, parameters, **others)
+    return Job(spec.kind, labels, tuple(words), folder, parameters, config, settings=f"s{settings}", **others)
 
 
 def finished(job: Job) -> dict[str, Any] | None:
@@ -237,39 +245,17 @@ def _differing(then: dict[str, Any], job: Job) -> list[str]:
 
 
 def missing(jobs: Sequence[Job], name: str) -> list[Job]:
-    """The jobs without a row in data/results/NAME.csv whose command trains, or runs, the same; a row of a notebook whose code has
-    changed since counts as none (rows that do not tell their code count)."""
-    from .recorded import load
-
+    """The jobs without a row in data/results/NAME.csv whose command trains, or runs, the same. A row whose profile, base policy,
+    demonstrations, notebook's code or defaults have changed since counts as none (rows that do not tell their settings count)."""
     try:
         rows = load(name)[0]
     except PdkitError:  # nothing is recorded yet
         return list(jobs)
-    codes = rows[CODE].fillna("") if CODE in rows else [""] * len(rows)
-    done = dict(zip(zip(rows.task, rows.recipe, rows.seed, map(essence, rows.command), strict=True), codes, strict=True))
+    settings = rows[SETTINGS].fillna("") if SETTINGS in rows else [""] * len(rows)
+    done = dict(zip(zip(rows.task, rows.recipe, rows.seed, map(essence, rows.command), strict=True), settings, strict=True))
 
     def there(job: Job) -> bool:
         key = (*(job.labels[name] for name in ("task", "recipe", "seed")), essence(job.command))
-        return key in done and done[key] in ("", code_of(job))
+        return key in done and done[key] in ("", job.settings)
 
     return [job for job in jobs if not there(job)]
-
-
-def code_of(job: Job) -> str:
-    """Which code a job's notebook has, as the column CODE of its row tells; empty for a training."""
-    code = job.config.get(CHECKED, "")
-    return code and f"c{code[:12]}"  # with a letter: digits alone would be read from the table as a number
-
-
-def essence(command: str) -> tuple[str, ...]:
-    """The parts of a command on which its row depends, sorted; a command other than `pdkit train decorated` counts as it stands."""
-    head, *options = command.split(" --")
-    if not head.startswith("pdkit train decorated"):
-        return (command,)
-    parts = {head}
-    for name, _, value in (option.partition(" ") for option in options):
-        if name == "set":
-            parts |= {f"set {word}" for word in shlex.split(value) if word.partition("=")[0] not in NO_MATTER}
-        elif name not in ("record", "threads") and (name, value) != ("method", DEFAULTS["method"]):
-            parts.add(f"{name} {value}")
-    return tuple(sorted(parts))

@@ -46,7 +46,8 @@ class Job:
     words: tuple[str, ...]  # arguments of pdkit, without --out
     folder: Path  # its name holds a hash of the parameters
     parameters: dict[str, Any]
-    config: dict[str, Any] = field(default_factory=dict)  # everything that these parameters amount to today (of a notebook: its code)
+    config: dict[str, Any] = field(default_factory=dict)  # everything that these parameters amount to today (of a notebook: its code, too)
+    settings: str = ""  # the beginning of a checksum of that, without the seed and what does not matter: s and 12 digits
     like: str = ""  # jobs that are alike take alike long: a method, a notebook
     minutes: float | None = None  # expected
     out: str = ""  # where the command writes; empty: to `run` in the folder

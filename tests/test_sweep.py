@@ -16,7 +16,7 @@ import pandas as pd
 import pytest
 from sweep_jobs import job, play
 
-from pdkit import cli, nb, recorded, sweep, sweep_jobs, sweep_ray, sweep_run
+from pdkit import cli, nb, profiles, recorded, report, sweep, sweep_jobs, sweep_ray, sweep_run
 from pdkit.demos.sources import bundled
 from pdkit.errors import PdkitError
 from pdkit.files import DATA, ROOT, read_json, write_json
@@ -447,13 +447,65 @@ def test_missing_leaves_out_what_is_recorded_by_the_same_command_alone(tmp_path,
     assert started == [second] and len(pd.read_csv(results / "tiny.csv")) == 2
 
 
-def test_rows_of_a_notebook_whose_code_has_changed_since_are_missing(tmp_path, results):
-    job, = sweep_jobs.make_jobs(load_spec(written(tmp_path, **BOOK | {"grid": None, "cells": [{"recipe": "a"}], "seeds": [0]})))
-    row = job.labels | {"command": job.command}
-    for code, gone in ((sweep_jobs.code_of(job), []), ("0123456789ab", [job]), (None, [])):
-        recorded.record("nbs", pd.DataFrame([row | {sweep_jobs.CODE: code}]), pd.DataFrame())
-        assert sweep_jobs.missing([job], "nbs") == gone
-    assert sweep_jobs.code_of(job)[0] == "c" and len(sweep_jobs.code_of(job)) == 13  # never a number to pandas
+def test_rows_whose_settings_have_changed_since_are_missing(tmp_path, results):
+    book = BOOK | {"grid": None, "cells": [{"recipe": "a"}], "seeds": [0]}
+    for spec in (written(tmp_path, **book), written(tmp_path, grid={"alpha": [0.1]})):
+        job, = sweep_jobs.make_jobs(load_spec(spec))[:1]
+        row = job.labels | {"command": job.command}
+        for settings, gone in ((job.settings, []), ("s123456789ab", [job]), (None, [])):
+            recorded.record("marked", pd.DataFrame([row | {recorded.SETTINGS: settings}]), pd.DataFrame())
+            assert sweep_jobs.missing([job], "marked") == gone
+        assert job.settings[0] == "s" and len(job.settings) == 13  # never a number to pandas
+
+
+def test_settings_are_those_of_the_profile_and_of_the_notebooks_defaults(tmp_path, monkeypatch):
+    """Both decide what a job computes, and neither is among the spec's values."""
+    path = written(tmp_path, seeds=[0, 1])
+    before = [job.settings for job in sweep_jobs.make_jobs(load_spec(path))]
+    assert len(set(before)) == 2 and before[:2] == before[2:]  # a recipe's, whatever the seed
+    monkeypatch.setitem(profiles._SMOKE, "utd", 0.5)
+    after = [job.settings for job in sweep_jobs.make_jobs(load_spec(path))]
+    assert not set(before) & set(after)
+
+    book = tmp_path / "own.ipynb"
+    cell = 'profile = "smoke"\nout = ""\nlr = {}\nseed = 0\nthreads = {}'
+    spec = load_spec(written(tmp_path, **BOOK | {"grid": None, "fixed": {"notebook": str(book)}, "cells": [{"recipe": "a"}], "seeds": [0]}))
+
+    def settings(lr, threads=1):
+        source = nbformat.v4.new_code_cell(cell.format(lr, threads), metadata={"tags": ["parameters"]})
+        nbformat.write(nbformat.v4.new_notebook(cells=[source]), book)
+        job, = sweep_jobs.make_jobs(spec)
+        return job, job.settings
+
+    job, mark = settings(0.1)
+    write_json(job.result, {"settings": job.config, "seconds": 1.0})
+    assert sweep_jobs.finished(job) and settings(0.1, threads=2)[1] == mark
+    changed, other = settings(0.9)
+    assert other != mark
+    with pytest.raises(PdkitError, match="other values of lr than"):
+        sweep_jobs.finished(changed)
+
+
+def test_a_notebook_without_a_seed_runs_once(tmp_path):
+    book = tmp_path / "own.ipynb"
+    cell = nbformat.v4.new_code_cell('profile = "smoke"\nout = ""', metadata={"tags": ["parameters"]})
+    nbformat.write(nbformat.v4.new_notebook(cells=[cell]), book)
+    values = BOOK | {"grid": None, "fixed": {"notebook": str(book)}, "cells": [{"recipe": "a"}]}
+    job, = sweep_jobs.make_jobs(load_spec(written(tmp_path, **values | {"seeds": [0]})))
+    assert not [word for word in job.words if word.startswith("seed=")]
+    with pytest.raises(PdkitError, match="own has no parameter `seed`"):
+        sweep_jobs.make_jobs(load_spec(written(tmp_path, **values | {"seeds": [0, 1]})))
+
+
+def test_rows_of_one_recipe_that_were_made_otherwise_are_told(results, capsys):
+    command = "pdkit train decorated Door --method rot --profile lesson --recipe {} --episodes 60 --seeds {} --set total_steps={}"
+    rows = pd.DataFrame([{"task": "Door", "recipe": recipe, "seed": seed, "command": command.format(recipe, seed, steps), "settings": mark}
+                         for recipe, seed, steps, mark in (("a", 0, 40_000, None), ("a", 1, 80_000, None), ("b", 0, 40_000, "s1"),
+                                                           ("b", 1, 40_000, "s2"), ("c", 0, 40_000, "s1"), ("c", 1, 40_000, None))])
+    recorded.record("mix", rows, pd.DataFrame())
+    said = capsys.readouterr().out
+    assert [f"of Door {recipe} were run with different settings" in said for recipe in "abc"] == [True, True, False]
+    assert recorded.mixed("mix", rows) == [line for line in report.table_problems("mix", rows, results) if "different" in line] != []
 
 
 @pytest.mark.parametrize("other, same", [
@@ -463,7 +515,7 @@ def test_rows_of_a_notebook_whose_code_has_changed_since_are_missing(tmp_path, r
     ("pdkit train decorated Pen --seeds 1 --set alpha=0.1 utd=1", False), ("pdkit train decorated Door --seeds 1 --set alpha=0.1", False),
     ("pdkit train decorated Door --seeds 1 --pixels --set alpha=0.1 utd=1", False)])
 def test_commands_are_the_same_where_what_differs_makes_no_difference(other, same):
-    assert (sweep_jobs.essence(other) == sweep_jobs.essence("pdkit train decorated Door --seeds 1 --set alpha=0.1 utd=1")) == same
+    assert (recorded.essence(other) == recorded.essence("pdkit train decorated Door --seeds 1 --set alpha=0.1 utd=1")) == same
 
 
 def test_the_main_jobs_recorded_rows_are_those_of_its_sweep():
