@@ -25,6 +25,7 @@ from .methods import METHODS
 from .methods.jsrl import JumpStart
 from .methods.ppo import OnPolicy
 from .methods.registry import base_folder, get_method, method_config, trainer_of
+from .methods.scratch import Scratch
 from .pixels.pictures import encoded, pictures_of
 from .pixels.task import encoder_of
 from .plots_compare import labelled, over_seeds
@@ -39,7 +40,7 @@ from .tasks.partnet import object_set
 from .train import decorate
 from .transfer import load_any
 
-SCRATCH = "from scratch"
+SCRATCH, OTHERS = "from scratch", "others"
 FAMILIES = {  # how the methods are told apart in a figure: by what learns
     "a small network on a frozen policy": ("policy_decorator", "residual_rl", "jsrl", "fish"),
     "fine-tuning the policy itself": ("sac_finetune", "rlpd_paper", "calql", "rot", "dipo"),
@@ -74,21 +75,25 @@ def method_of(recipe: str) -> str:
 
 
 def titles(recipes: Sequence[str]) -> dict[str, str]:
-    """Recipe -> what it is called, in the order of FAMILIES; settings of a recipe METHOD,NAME=VALUE stay behind the title."""
+    """Recipe -> what it is called, in the order of FAMILIES, a reader's own methods last; settings of a recipe METHOD,NAME=VALUE stay
+    behind the title."""
     order = [name for family in FAMILIES.values() for name in family]
+    order += [name for name in METHODS if name not in order]
     known = sorted(dict.fromkeys(recipes), key=lambda recipe: order.index(method_of(recipe)))
     return {r: ", ".join([METHODS[method_of(r)].title, *r.split(",")[1:]]) for r in known}
 
 
 def families(recipes: Sequence[str]) -> dict[str, list[str]]:
-    """Panels of a figure: family -> those of `recipes` that belong to it, in the order of `titles`; empty ones are left out."""
-    found = {name: [r for r in titles(recipes) if method_of(r) in members] for name, members in FAMILIES.items()}
+    """Panels of a figure: family -> those of `recipes` that belong to it, in the order of `titles`, and those of none last; empty ones
+    are left out."""
+    others = set(METHODS).difference(*FAMILIES.values())
+    found = {name: [r for r in titles(recipes) if method_of(r) in members] for name, members in (FAMILIES | {OTHERS: others}).items()}
     return {name: members for name, members in found.items() if members}
 
 
 def from_scratch(recipe: str) -> bool:
     """Whether a method starts without a policy, so that its row's base_success is not where it started."""
-    return method_of(recipe) in FAMILIES[SCRATCH]
+    return method_of(recipe) in FAMILIES[SCRATCH] or issubclass(trainer_of(method_of(recipe)), Scratch)
 
 
 def shared(table: pd.DataFrame) -> pd.DataFrame:
@@ -252,8 +257,8 @@ def own_run(method: str, task: str, profile: str, seed: int, folder: Path, episo
     It starts from the policy in `base`, or from that of `start_of`. Two columns more than a recorded row has:
     start and folder, where the policy lies that it started from, and the run (see `before_and_after`).
 
-    A finished run with the same settings is read, an interrupted one goes on. Raises PdkitError for an unknown method or setting, and
-    where the policy is missing that the method starts from.
+    A finished run with the same settings is read (and that is told), an interrupted one goes on. Raises PdkitError for an unknown
+    method or setting, and where the policy is missing that the method starts from.
     """
     start = base or start_of(method, task)
     card, policy = read_card(start), load_policy(start)
@@ -265,7 +270,9 @@ def own_run(method: str, task: str, profile: str, seed: int, folder: Path, episo
     settings = flat(config) | started_from
     mark = hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:8]
     run = Run(folder / f"{method}-seed{seed}-{mark}", "decorated", settings)
-    if not run.finished or run.manifest["results"]["episodes"] != episodes:
+    if run.finished and run.manifest["results"]["episodes"] == episodes:
+        print(run.already())
+    else:
         seen = encoded(demos, pictures_of(demos), encoder) if encoder and demos else demos
         decorate(config, policy, seen, run.folder, episodes, started_from, encoder=encoder)
         run = Run(run.folder, "decorated", settings)

@@ -148,7 +148,11 @@ def run_notebook(name: str, parameters: dict[str, Any] | None, out: str | Path, 
     path, values, out = find_notebook(name), checked_parameters(name, parameters or {}), Path(out).resolve()
     write_json(folder(out) / "parameters.json", values)  # finds out now whether the folder can be written
     (out / RESULT).unlink(missing_ok=True)
-    execute(path, {**values, "out": str(out)}, out, timeout, progress)
+    try:
+        execute(path, {**values, "out": str(out)}, out, timeout, progress)
+    except BaseException:  # Ctrl-C, too: a notebook that wrote its result and then failed did not come to its end
+        (out / RESULT).unlink(missing_ok=True)
+        raise
     if not (out / RESULT).exists():
         raise PdkitError(f"Notebook {path.stem} ran to its end but wrote no {RESULT} into {out}; "
                          "its last cell must call nb.finish(result, out).")

@@ -73,7 +73,8 @@ def execute(path: Path, values: dict[str, Any], out: Path, timeout: float | None
 
 
 def _one_line(text: str) -> str:
-    return " ".join(text.split()).rstrip(".")[:300]
+    """A notebook's words for a terminal: without line breaks, and without the escape sequences by which they could command it."""
+    return "".join(letter for letter in " ".join(text.split()) if letter.isprintable()).rstrip(".")[:300]
 
 
 def _kept(output: Path, watch: _Progress, kind: str, what: str) -> PdkitError:
@@ -116,7 +117,7 @@ class _Progress:
     def _watch(self) -> None:
         while not self._stop.wait(1.0):
             try:
-                note = self._note.read_text()
+                note = _one_line(self._note.read_text(errors="replace"))
             except OSError:
                 note = ""
             self._line.update(self._text(note))

@@ -16,6 +16,7 @@ from .decorated import Decorated
 from .errors import PdkitError
 from .evaluate import selection_scores
 from .policies import Policy
+from .tasks.lanes import must_be_importable
 from .tasks.spec import TaskSpec
 from .torch_setup import one_thread, set_threads
 
@@ -40,6 +41,7 @@ class Evaluations:
         self.pending: dict[int, State] = {}  # step -> weights not scored yet: part of a checkpoint
         self._process, self._busy = None, False
         if workers:
+            must_be_importable(spec.make, type(policy))
             context = multiprocessing.get_context("spawn")  # fork is unsafe once torch has threads
             self._pipe, theirs = context.Pipe()
             self._process = context.Process(target=_worker, args=(theirs, self._arguments), daemon=True)

@@ -13,7 +13,7 @@ from functools import partial
 import numpy as np
 import torch
 
-from .policies.base import Normalizer, Policy
+from .policies.base import Policy
 from .tasks.spec import TaskSpec
 
 
@@ -96,10 +96,6 @@ class ProbeBase(Policy):
     """A base policy known exactly. Config: obs_dim, act_dim, kind ("zero", or "reach": towards the goal, missed by `bias`)."""
 
     kind = "probe"
-
-    def __init__(self, config):
-        super().__init__(config)
-        self.normalizer = Normalizer(config["obs_dim"])
 
     def forward(self, windows: torch.Tensor) -> torch.Tensor:
         now = windows[:, -1]

@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 
 from .errors import PdkitError
-from .files import ROOT, atomic_file, atomic_folder, locked, read_json, recover, sha256, write_json
+from .files import ROOT, atomic_file, atomic_folder, code_checksum, locked, read_json, recover, sha256, write_json
 from .machine import cores, cpu_has_bf16
 
 PACKAGES = ("torch", "numpy", "gymnasium", "gymnasium-robotics", "mujoco", "mani-skill", "sapien")
@@ -103,8 +103,10 @@ class Run:
         """
         with locked(self.folder / "lock", f"Another process is at work in {self.folder}; wait for it, or choose another folder."):
             self.manifest = read_json(self.manifest_path)
-            if not self.finished and (machine := describe_machine()) != machines(self.manifest)[-1]:
-                self.manifest.setdefault("resumed", []).append({"at": _now(), "machine": machine})
+            if not self.finished:
+                if (machine := describe_machine()) != machines(self.manifest)[-1]:
+                    self.manifest.setdefault("resumed", []).append({"at": _now(), "machine": machine})
+                self.manifest["code"] = code_checksum()
                 self._write_manifest()
             yield
 
@@ -116,6 +118,11 @@ class Run:
         """Mark the run complete and store its results in the manifest."""
         self.manifest |= {"finished": _now(), "results": results}
         self._write_manifest()
+
+    def already(self) -> str:
+        """That a finished run is not trained again, and what to do for that, in a sentence."""
+        changed = ", and the kit's code has changed since" if self.manifest.get("code") not in (None, code_checksum()) else ""
+        return f"Trained already ({self.manifest['finished'][:16]} UTC{changed}); to train it again, delete {self.folder}"
 
     def write_metrics(self, rows: list[dict[str, Any]]) -> None:
         """metrics.csv, one row each."""

@@ -35,7 +35,7 @@ def _keep_exit_codes(handler: Any) -> None:
 class Ray:
     """A Ray task for each job, never retried.
 
-    On a cluster every node needs this project, and the results' folder, under the same path.
+    On a cluster every node needs this project, and the results' folder, under the same path; PDKIT_PARTNET goes along.
     """
 
     def __init__(self, address: str | None, workers: int | None):
@@ -47,9 +47,10 @@ class Ray:
         self._ray = ray
         path = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
         before = signal.getsignal(signal.SIGCHLD) or signal.SIG_DFL
+        handed = {"PYTHONPATH": path} | {name: os.environ[name] for name in ("PDKIT_PARTNET",) if name in os.environ}
         own = {"address": address} if address else {"address": "local", "num_cpus": workers or 2, "include_dashboard": False}
         try:
-            ray.init(**own, log_to_driver=False, logging_level="error", runtime_env={"env_vars": ONE_THREAD | {"PYTHONPATH": path}})
+            ray.init(**own, log_to_driver=False, logging_level="error", runtime_env={"env_vars": ONE_THREAD | handed})
         except Exception as error:  # ConnectionError, ValueError, RuntimeError ...: depends on what is wrong with the address
             raise PdkitError(f"Ray does not start at {address or 'this machine'}: {reason(error)[:200].rstrip('.')}.") from None
         _keep_exit_codes(before)

@@ -24,7 +24,8 @@ All cells run with the first seed, then all with the next: a sweep that is stopp
 
 A training's values are the options of `pdkit train decorated` (task, method, profile, episodes, base, demos, num_demos) and
 any field of its configuration; a base policy's are these options of `pdkit train base` (task, policy, episodes, demos, num_demos) and what
-it takes by --set; a notebook's are `notebook` and its parameters. Paths are relative to the project's folder.
+it takes by --set; a notebook's are `notebook` and its parameters. Paths are relative to the project's folder; so base policies that a
+sweep makes lie in its runs/, even where PDKIT_RUNS has the results elsewhere.
 """
 from __future__ import annotations
 
@@ -138,6 +139,11 @@ def _cells(file: str, name: str, fixed: dict[str, Any], grid: dict[str, Any], fu
 
 
 def _recipe(cell: dict[str, Any], name: str) -> str:
-    """What a cell is called: the values in which it differs."""
-    parts = [str(value) if key == "method" else f"{key}={value}" for key, value in cell.items() if key not in ("task", "notebook", "seeds")]
+    """What a cell is called: the values in which it differs, of lists and paths what may stand in a folder's name."""
+    parts = [_word(value) if key == "method" else f"{key}={_word(value)}" for key, value in cell.items()
+             if key not in ("task", "notebook", "seeds")]
     return ",".join(parts) or name
+
+
+def _word(value: Any) -> str:
+    return re.sub(r"[^\w.+=-]", "", str(value).replace(", ", "+").replace(": ", "=").replace("/", "-"))

@@ -7,7 +7,7 @@ import json
 import math
 import shlex
 import sys
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
@@ -215,6 +215,8 @@ def decorate(config, base: Policy, demos: Demos | None, out: Path, episodes: int
     trainer = make_trainer(config, base, demos, pixel_spec(get_task(config.task), encoder) if encoder else None)
     run = Run(out, "decorated", flat(config) | started_from)  # after what may be refused
     with run.alone():
+        if run.finished:
+            print(run.already(), flush=True)
         policy = _trained(trainer, run, tensorboard, encoder)
         tables = {"base": _base_episodes(base, trainer.spec, episodes, config, started_from),
                   "decorated": _episodes(policy, trainer.spec, episodes, config.seed)}
@@ -267,10 +269,14 @@ def _episodes(actor: Policy | Decorated, spec: TaskSpec, episodes: int, draw: in
 def _base_episodes(base: Policy, spec: TaskSpec, episodes: int, config: OnlineConfig, started_from: dict[str, Any]
                    ) -> pd.DataFrame:
     """The base policy's test episodes: the same for every method that starts from it, and for every seed unless it samples, so they are run
-    once and kept."""
+    once and kept, where the kit's own code decides them: that of a task or policy from elsewhere is not seen to change."""
+    make = getattr(spec.make, "func", spec.make)
+    if not all(one.__module__.startswith("pdkit.") for one in (make, type(base))):
+        return _episodes(base, spec, episodes, config.seed)
     draw = [config.seed] if base.samples else []
     weights = [started_from[name] for name in ("base", "encoder", "objects") if name in started_from]
-    what = json.dumps([spec.name, config.start_fraction, episodes, *weights, base.kind, base.config, describe_machine()["versions"],
+    of_task = {field.name: getattr(spec, field.name) for field in fields(spec)} | {"make": f"{make.__module__}.{make.__qualname__}"}
+    what = json.dumps([of_task, config.start_fraction, episodes, *weights, base.kind, base.config, describe_machine()["versions"],
                        code_checksum(), *draw])
     kept = runs_root() / "base_episodes" / f"{spec.name}-{hashlib.sha256(what.encode()).hexdigest()[:16]}.csv"
     if not kept.exists():

@@ -7,10 +7,11 @@ import pytest
 from matplotlib.colors import to_hex
 
 from pdkit import ablations, claims, compare, plots_compare, recorded
+from pdkit import runs as runs_module
 from pdkit.claims import TooLittle
 from pdkit.errors import PdkitError
 from pdkit.files import DATA
-from pdkit.methods import METHODS
+from pdkit.methods import METHODS, Method
 from pdkit.policies import load_policy
 from pdkit.seeds import reported_seeds
 from pdkit.sweep_spec import load_spec
@@ -54,6 +55,15 @@ def test_every_method_has_one_family_and_a_place():
     assert compare.from_scratch("rlpd,n_step=1") and not compare.from_scratch("jsrl")
     with pytest.raises(PdkitError, match="jslr.*Did you mean 'jsrl'"):
         compare.titles(["jslr"])
+
+
+def test_a_method_of_the_readers_own_comes_last(monkeypatch):
+    own = {"mine": Method("Mine", "me"), "blank": Method("Blank", "me", trainer="pdkit.methods.scratch:Scratch")}
+    for name, method in own.items():
+        monkeypatch.setitem(METHODS, name, method)
+    assert list(compare.titles(["mine", "rlpd", "mine,alpha=1"])) == ["rlpd", "mine", "mine,alpha=1"]
+    assert compare.families(["mine", "rlpd"]) == {"from scratch": ["rlpd"], "others": ["mine"]}
+    assert compare.from_scratch("blank") and not compare.from_scratch("mine")
 
 
 def test_runs_from_one_start_have_plain_names_and_stand_apart():
@@ -240,7 +250,7 @@ def test_comparisons_start_from_a_behavior_transformer():
     assert all(load_policy(DATA / "checkpoints" / f).kind in (*claims.BETS, "vinn") for f in folders.values())
 
 
-def test_an_own_run_is_a_recorded_row_and_is_made_once(tmp_path, monkeypatch):
+def test_an_own_run_is_a_recorded_row_and_is_made_once(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("PDKIT_RUNS", str(tmp_path / "runs"))
     settings = dict(total_steps=260, warmup_steps=100, eval_every=0, log_every=100, batch=32)
     row, curve = compare.own_run("residual_rl", "Door", "smoke", 3, tmp_path, 1, **settings)
@@ -250,7 +260,13 @@ def test_an_own_run_is_a_recorded_row_and_is_made_once(tmp_path, monkeypatch):
     before, after, episode = compare.before_and_after(row)
     assert before.kind == "bet" and after.config.alpha == 1.0 and episode == reported_seeds(1)[0]
     monkeypatch.setattr(compare, "decorate", lambda *a: pytest.fail("it trained again"))
+    capsys.readouterr()
     again, _ = compare.own_run("residual_rl", "Door", "smoke", 3, tmp_path, 1, "mine", **settings)
+    said = capsys.readouterr().out
+    assert said.startswith("Trained already (20") and "code has changed" not in said and f"delete {row.folder[0]}" in said
+    monkeypatch.setattr(runs_module, "code_checksum", lambda: "edited")
+    compare.own_run("residual_rl", "Door", "smoke", 3, tmp_path, 1, **settings)
+    assert "and the kit's code has changed since" in capsys.readouterr().out
     assert again.recipe[0] == "mine" and again.updates[0] == row.updates[0]
     for name, task, message in (("residal_rl", "Door", "Did you mean"), ("fish", "StackCube", "FISH starts from a policy .* StackCube")):
         with pytest.raises(PdkitError, match=message):

@@ -57,7 +57,8 @@ def test_a_safetensors_file_of_something_else_is_refused(tmp_path):
 @pytest.mark.parametrize(("change", "says"), [
     (dict(task="Pen"), "shape"), (dict(label="robot"), "label"), (dict(actions=np.full((14, 28), 2.0, np.float32)), "outside"),
     (dict(observations=np.full((16, 39), np.nan, np.float32)), "NaN"), (dict(success=np.zeros(3, bool)), "success"),
-    (dict(seeds=np.zeros(5, np.int64)), "seeds"), (dict(lengths=np.array([14, 0])), "empty"), (dict(task="Doors"), "Unknown task"),
+    (dict(seeds=np.zeros(5, np.int64)), "seeds"), (dict(seeds=np.array([0, 10**6])), "1,000,000 to 2,999,999"),
+    (dict(lengths=np.array([14, 0])), "empty"), (dict(task="Doors"), "Unknown task"),
 ])
 def test_wrong_contents(demos, change, says):
     with pytest.raises(PdkitError, match=says):

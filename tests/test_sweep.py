@@ -164,6 +164,14 @@ def written(folder: Path, **changes) -> Path:
     return path
 
 
+def test_cells_of_lists_and_paths_have_names_that_folders_can_have(tmp_path):
+    scales = [[1.0] * 28, [0.5] * 28]
+    jobs = sweep_jobs.make_jobs(load_spec(written(tmp_path, grid={"alpha_scale": scales}, seeds=[0])))
+    assert [job.labels["recipe"] for job in jobs] == [f"alpha_scale={'+'.join(map(str, scale))}" for scale in scales]
+    spec = load_spec(written(tmp_path, grid={"base": ["runs/base/own"], "changes": [{"utd": 0.2}]}))
+    assert spec.cells[0]["recipe"] == "base=runs-base-own,changes=utd=0.2"
+
+
 def test_cells_are_the_grid_and_the_further_ones_by_each_seed(tmp_path):
     path = written(tmp_path, seeds=[0, 1], grid={"alpha": [0.1, 0.3], "H": [0, 100]},
                    cells=[{"critic_input": "concat"}, {"recipe": "other", "method": "residual_rl"}])
@@ -268,7 +276,7 @@ def test_the_folder_follows_every_parameter_and_nothing_else(tmp_path):
     ({"fixed": {"task": "Door", "episodes": 0}}, "episodes must be a whole number"),
     ({"fixed": {"task": "Door", "base": "runs/none"}}, "runs/none/policy.json does not exist"),
     ({"fixed": {"task": "Door", "demos": "runs/none.safetensors"}}, "none.safetensors"),
-    ({"grid": {"alpha_scale": [[1, 2]]}}, "Give the cell 'alpha_scale=[1, 2]' a recipe"),
+    ({"cells": [{"alpha": 0.1, "recipe": "a/b"}]}, "Give the cell 'a/b' a recipe"),
     ({"cells": [{"alpha": 0.1, "recipe": "again"}]}, "alpha=0.1 and again are the same job"),
     ({"cells": [{"alpha": 0.2, "recipe": "alpha=0.1"}]}, "are called the same"),
     ({"bases": {"data/own": {"task": "Door"}}}, "a base policy that a sweep makes lies below runs/"),
@@ -720,9 +728,11 @@ def fake_ray(monkeypatch):
     return fake
 
 
-def test_a_cluster_decides_how_many_jobs_run_and_no_job_is_tried_twice(fake_ray):
+def test_a_cluster_decides_how_many_jobs_run_and_no_job_is_tried_twice(fake_ray, monkeypatch):
+    monkeypatch.setenv("PDKIT_PARTNET", "/objects")
     backend = sweep_ray.Ray("10.0.0.1:6379", None)
     (_, asked), (_, task) = fake_ray.calls
+    assert asked["runtime_env"]["env_vars"]["PDKIT_PARTNET"] == "/objects"  # its rows will be called so
     assert backend.limit == 6 and asked["address"] == "10.0.0.1:6379" and "num_cpus" not in asked
     assert asked["runtime_env"]["env_vars"]["PYTHONPATH"].startswith(str(sweep_ray.ROOT)) and task == {"num_cpus": 1, "max_retries": 0}
     assert sweep_ray.Ray("10.0.0.1:6379", 3).limit == 3

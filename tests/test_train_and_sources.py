@@ -160,7 +160,7 @@ def test_agent_episodes_are_what_the_simulator_did(monkeypatch):
         assert np.allclose(moved, e["observations"][1:, :2], atol=1e-5)
 
 
-def test_training_from_the_command_line_records_a_row_a_seed(monkeypatch, tmp_path):
+def test_training_from_the_command_line_records_a_row_a_seed(monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(recorded, "DATA", tmp_path)
     monkeypatch.setenv("PDKIT_RUNS", str(tmp_path / "runs"))
     refused = []
@@ -176,7 +176,9 @@ def test_training_from_the_command_line_records_a_row_a_seed(monkeypatch, tmp_pa
     words = ["train", "decorated", "Door", "--profile", "smoke", "--seeds", "0", "--episodes", "2", "--record", "t",
              "--set", "eval_episodes=1"]
     assert call(monkeypatch, *words) == 0 and len(refused) == 3  # while it trains, and while base and decorated are tested
+    capsys.readouterr()
     assert call(monkeypatch, *words) == 0  # finished already: the same row, not a second one
+    assert "Trained already" in capsys.readouterr().out
     table = pd.read_csv(tmp_path / "results" / "t.csv")
     assert len(table) == 1 and table.env_steps[0] >= 600 and table.command[0].startswith("pdkit train decorated Door --profile smoke")
     assert (tmp_path / "results" / "t.png").stat().st_size > 1000
@@ -243,6 +245,21 @@ def test_a_base_policy_that_samples_is_tested_on_random_numbers_of_each_run(monk
     shape = dict(obs_dim=3, act_dim=2, dims=[8])
     assert not DiffusionPolicy(shape | dict(temperature=0.0)).samples and DiffusionPolicy(shape | dict(sampler="ddpm")).samples
     assert BeT(dict(obs_dim=3, act_dim=2, act_dropout=True)).samples and not BeT(dict(obs_dim=3, act_dim=2)).samples
+
+
+def test_episodes_of_code_from_elsewhere_are_not_kept(monkeypatch, tmp_path):
+    """It may be another one the next time, by the same name and weights."""
+    monkeypatch.setenv("PDKIT_RUNS", str(tmp_path))
+    tested = []
+    monkeypatch.setattr(train, "evaluate", lambda *_, **__: tested.append(1) or pd.DataFrame({"success_once": [0]}))
+    door, base = get_task("Door"), load_policy(DATA / "checkpoints" / "Door" / "base")
+    foreign = type("Mine", (ProbeBase,), {"__module__": "elsewhere"})(base.config | {"kind": "zero"})
+    sim = type("Sim", (), {"__module__": "elsewhere"})
+    for spec, policy, wanted in ((door, base, 1), (door, base, 0), (replace(door, max_episode_steps=9), base, 1), (door, foreign, 1),
+                                 (door, foreign, 1), (replace(door, make=sim), base, 1), (replace(door, make=sim), base, 1)):
+        tested.clear()
+        train._base_episodes(policy, spec, 2, online_config("Door", "lesson", 0), {"base": "x"})
+        assert len(tested) == wanted
 
 
 def test_the_command_of_a_row_can_be_pasted_into_a_shell():

@@ -159,6 +159,14 @@ def test_workers_change_nothing_on_a_real_task():
         assert np.array_equal(one.windows, other.windows) and one.episodes == other.episodes
 
 
+def test_a_simulator_from_a_notebook_is_refused_by_other_processes_alone(monkeypatch):
+    spec = dataclasses.replace(COUNT, make=type("Mine", (CountSim,), {"__module__": "__main__"}))
+    env = VectorEnv(spec, 2, counting_seeds())
+    env.close()
+    with pytest.raises(PdkitError, match="Mine is defined in a notebook .* or set env_workers=0"):
+        VectorEnv(spec, 2, counting_seeds(), workers=1)
+
+
 def test_idle_lanes_stay_idle():
     queue = [3, 2, 1]
     with VectorEnv(COUNT, 2, lambda lane: queue.pop() if queue else IDLE) as env:

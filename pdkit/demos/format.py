@@ -16,6 +16,7 @@ import numpy as np
 
 from ..errors import PdkitError
 from ..files import atomic_file
+from ..seeds import ROLLOUT, TEST
 from ..tasks import get_task
 from ..tasks.partnet import object_set
 from ..tasks.spec import TaskSpec
@@ -104,6 +105,8 @@ def validate(demos: Demos, where: str = "demonstrations", spec: TaskSpec | None 
          f"actions have shape {demos.actions.shape}, {spec.name} needs {(total, spec.act_dim)}"),
         (demos.success.shape != (total,), f"success has shape {demos.success.shape}, not {(total,)}"),
         (demos.seeds.shape != (num,), f"seeds have shape {demos.seeds.shape}, not {(num,)}"),
+        (((demos.seeds >= TEST) & (demos.seeds < ROLLOUT)).any(), f"an episode has a seed from {TEST:,} to {ROLLOUT - 1:,}, and these are "
+         "for testing and for choosing policies"),
         (not np.isfinite(demos.observations).all() or not np.isfinite(demos.actions).all(), "a number is NaN or infinite"),
         (demos.actions.size > 0 and float(np.abs(demos.actions).max(initial=0)) > 1.0 + 1e-6, "an action lies outside [-1, 1]"),
     ]

@@ -46,7 +46,9 @@ class Policy(nn.Module):
     """A policy over a window of observations: (N, window, obs_dim) -> an action chunk (N, chunk, act_dim) in [-1, 1].
 
     The window is kept by the vectorised environment, so a policy holds no state per episode; `reset(seed)` restarts
-    its own random numbers (dropout, sampling).
+    its own random numbers (dropout, sampling). What it has of its own accord: `config`, and a `normalizer` for `fit_statistics` to fit,
+    through which networks beside it (a residual, a critic) see observations as it does. A subclass that draws random numbers to act must
+    say so in `samples`.
     """
 
     kind = ""  # its name in POLICIES
@@ -64,6 +66,7 @@ class Policy(nn.Module):
         super().__init__()
         # Everything its constructor needs, JSON types only.
         self.config = checked_settings(self.kind, self.defaults | config, self.defaults, self.least)
+        self.normalizer = Normalizer(self.config["obs_dim"])
 
     @classmethod
     def for_task(cls, spec: TaskSpec) -> dict[str, Any]:

@@ -16,7 +16,7 @@ import torch.nn.functional as F
 from torch import nn
 
 from ..errors import PdkitError
-from .base import Normalizer, Policy
+from .base import Policy
 
 
 class Block(nn.Module):
@@ -94,7 +94,6 @@ class BeT(Policy):
         if c["embed"] % c["heads"]:
             raise PdkitError(f"BeT's embed ({c['embed']}) must be a multiple of its heads ({c['heads']}).")
         self.window = c["window"]
-        self.normalizer = Normalizer(c["obs_dim"])
         self.gpt = GPT(c["obs_dim"], c["features"], c["window"], c["layers"], c["heads"], c["embed"], c["dropout"])
         self.head = nn.Linear(c["features"], c["bins"] * (1 + c["act_dim"]))  # K logits, then K offsets
         nn.init.normal_(self.head.weight, std=0.02)

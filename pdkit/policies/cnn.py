@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from torch import nn
 
 from ..errors import PdkitError
-from .base import Normalizer, Policy
+from .base import Policy
 
 
 class CNN(Policy):
@@ -25,7 +25,6 @@ class CNN(Policy):
         if c["kernel"] % 2 != 1:
             raise PdkitError(f"The CNN's kernel must be odd, so that the window keeps its length, not {c['kernel']}.")
         self.window = c["window"]
-        self.normalizer = Normalizer(c["obs_dim"])
         sizes = [c["obs_dim"], *[c["hidden"]] * c["layers"]]
         layers = [m for a, b in zip(sizes[:-1], sizes[1:], strict=True) for m in (nn.Conv1d(a, b, c["kernel"], padding="same"), nn.ReLU())]
         self.net = nn.Sequential(*layers, nn.Flatten(), nn.Linear(sizes[-1] * self.window, c["act_dim"]))

@@ -111,7 +111,6 @@ class DiffusionPolicy(Policy):
                              f"{c['obs_encoder']}.")
         if not 1 <= c["sampler_steps"] <= c["diffusion_steps"]:
             raise PdkitError(f"sampler_steps must be from 1 to diffusion_steps ({c['diffusion_steps']}), not {c['sampler_steps']}.")
-        self.normalizer = Normalizer(c["obs_dim"])
         self.scale = Normalizer(c["obs_dim"]) if c["own_scale"] else None
         self.limits = Limits(c["act_dim"]) if c["action_limits"] else None
         self.obs_encoder = obs_layers(c["obs_dim"] * self.window, c["obs_encoder"])

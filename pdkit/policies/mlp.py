@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from torch import nn
 
 from ..errors import PdkitError
-from .base import Normalizer, Policy
+from .base import Policy
 
 
 class MLP(Policy):
@@ -25,7 +25,6 @@ class MLP(Policy):
         c = self.config
         if c["window"] != 1:
             raise PdkitError(f"The MLP looks at one observation: leave window at 1 (now {c['window']}), or choose rnn or cnn.")
-        self.normalizer = Normalizer(c["obs_dim"])
         sizes = [c["obs_dim"], *[c["hidden"]] * c["layers"]]
         layers = [m for a, b in zip(sizes[:-1], sizes[1:], strict=True) for m in (nn.Linear(a, b), nn.ReLU())]
         self.net = nn.Sequential(*layers, nn.Linear(sizes[-1], c["act_dim"]))

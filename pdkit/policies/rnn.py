@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
-from .base import Normalizer, Policy
+from .base import Policy
 
 
 class BCRNN(Policy):
@@ -23,7 +23,6 @@ class BCRNN(Policy):
         super().__init__(config)
         c = self.config
         self.window = c["window"]
-        self.normalizer = Normalizer(c["obs_dim"])
         self.lstm = nn.LSTM(c["obs_dim"], c["hidden"], c["layers"], batch_first=True)
         self.head = nn.Linear(c["hidden"], c["act_dim"])
 

@@ -25,7 +25,7 @@ import torch.nn.functional as F
 from torch import nn
 
 from ..errors import PdkitError
-from .base import Normalizer, Policy, load_policy
+from .base import Policy, load_policy
 from .bet import BeT
 from .bet_sac import BeTForSAC
 from .diffusion import DiffusionPolicy
@@ -54,7 +54,6 @@ class VINN(Policy):
         if c["skip"] and (trained or c["skip"] >= c["obs_dim"]):
             raise PdkitError(f"VINN's skip leaves out some of raw observations ({c['obs_dim']} numbers), not {c['skip']} of "
                              f"{'a trained policy' if trained else 'them'}.")
-        self.normalizer = Normalizer(c["obs_dim"])
         self.gpt: nn.Module | None = trained.gpt if isinstance(trained, BeT) else None
         self.film: nn.Linear | None = trained.film() if isinstance(trained, DiffusionPolicy) else None
         self.obs_encoder: nn.Module | None = trained.obs_encoder if isinstance(trained, DiffusionPolicy) else None

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from .base import Normalizer, Policy
+from .base import Policy
 
 
 class Zero(Policy):
@@ -19,7 +19,6 @@ class Zero(Policy):
     def __init__(self, config: dict[str, Any]):
         super().__init__(config)
         self.window, self.chunk = self.config["window"], self.config["chunk"]
-        self.normalizer = Normalizer(self.config["obs_dim"])
 
     @classmethod
     def instead_of(cls, policy: Policy, window: int = 1, chunk: int = 1) -> Zero:

@@ -166,6 +166,14 @@ class InProcess:
         self._lanes.close(keep)
 
 
+def must_be_importable(*code: Callable) -> None:
+    """Raises PdkitError for a simulator or policy class that other processes cannot have: it is defined in a notebook or script."""
+    for one in (getattr(each, "func", each) for each in code):
+        if getattr(one, "__module__", "") == "__main__":
+            raise PdkitError(f"{one.__qualname__} is defined in a notebook or script, from where other processes cannot import it: move it "
+                             "into a module of its own, or set env_workers=0 and eval_workers=0.")
+
+
 class Workers:
     """Lanes spread over spawned processes; arrays in shared memory, one byte string a command. `make(count)` makes lanes there."""
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from ..errors import PdkitError, unknown
 from .batched import gpu_lanes
-from .lanes import IDLE, InProcess, Lanes, Workers
+from .lanes import IDLE, InProcess, Lanes, Workers, must_be_importable
 from .spec import TaskSpec
 
 SIMULATORS: dict[str, Callable[..., Any]] = {"cpu": Lanes, "physx_cuda": gpu_lanes}
@@ -92,6 +92,8 @@ class VectorEnv:
         make = partial(SIMULATORS[simulator], spec, rules=(self.limit, terminate_on_success, success_tail))
         if simulator == "physx_cuda":  # changes how its process simulates on the CPU, and must be there before anything else of PhysX
             workers = 1
+        if workers:
+            must_be_importable(spec.make)
         self._backend = Workers(shapes, num_envs, min(workers, num_envs), make) if workers else InProcess(shapes, num_envs, make)
         self._built: np.ndarray | None = None  # the seeds of the lanes' first episodes, where lanes keep the bodies of those
         self._keeps_bodies = simulator != "cpu"
