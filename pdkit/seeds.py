@@ -14,14 +14,17 @@ ROLLOUT = 3_000_000  # + i: episodes recorded from agents, the kit's Adroit demo
 
 
 def reported_seeds(num: int) -> list[int]:
+    """Of the first `num` test episodes: the same ones for every policy, so that two are compared episode by episode."""
     return list(range(TEST, TEST + num))
 
 
 def selection_seeds(num: int) -> list[int]:
+    """Of the first `num` episodes on which checkpoints are chosen."""
     return list(range(SELECT, SELECT + num))
 
 
 def rollout_seeds(num: int) -> list[int]:
+    """Of the first `num` episodes that are recorded from an agent."""
     return list(range(ROLLOUT, ROLLOUT + num))
 
 
