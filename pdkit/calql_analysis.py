@@ -169,11 +169,11 @@ def _joined(table: pd.DataFrame, curves: pd.DataFrame, others: pd.DataFrame, lin
 
 
 def late(curves: pd.DataFrame) -> pd.DataFrame:
-    """How steady each recorded setup is within its budget, means over seeds: recipe, seeds, best and last evaluation, and the largest fall
-    from one evaluation to the next. The best of several is flattered by chance, in every setup alike."""
+    """How steady each recorded setup is within its budget, and whatever else is recorded behind them, means over seeds: recipe, seeds, best
+    and last evaluation, and the largest fall from one evaluation to the next. The best of several is flattered by chance, in all alike."""
     rows = []
     evaluated = curves[(curves.step > 0) & curves.success_once.notna()] if "success_once" in curves else curves[:0]
-    for recipe in SETUPS.values():
+    for recipe in dict.fromkeys([*SETUPS.values(), *evaluated.recipe]):
         mine = evaluated[evaluated.recipe == recipe].sort_values("step")
         if mine.empty:
             continue

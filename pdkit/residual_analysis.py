@@ -123,13 +123,14 @@ def early_verdict(plain: Paired, guarded: Paired) -> tuple[str, list[str]]:
 
 # ---- over training ---------------------------------------------------------------------------------------------------
 
-def late_ratio(curves: pd.DataFrame) -> pd.DataFrame:
-    """mean |residual| / mean |base action| in the last quarter of the steps of each run: task, recipe, seed, ratio."""
+def size_ratio(curves: pd.DataFrame, after: float = 0.75) -> pd.DataFrame:
+    """mean |residual| / mean |base action| of each run behind this share of its steps, by default in the last quarter: task, recipe, seed,
+    ratio."""
     if "residual_size" not in curves:  # nothing is recorded, or by a loop that did not log it
         return pd.DataFrame(columns=["task", "recipe", "seed", "ratio"]).astype({"ratio": float})
     rows = curves[curves.residual_size.notna()]
     by = rows.groupby(["task", "recipe", "seed"])
-    late = rows[rows.step > 0.75 * by.step.transform("max")].groupby(["task", "recipe", "seed"])[["residual_size", "base_size"]].mean()
+    late = rows[rows.step > after * by.step.transform("max")].groupby(["task", "recipe", "seed"])[["residual_size", "base_size"]].mean()
     return (late.residual_size / late.base_size).rename("ratio").reset_index()
 
 

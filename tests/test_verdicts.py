@@ -128,8 +128,13 @@ def test_a_task_on_which_neither_learns_counts_where_the_claim_is_of_the_end(res
     assert verdicts.find(claim).verdict == "reproduced"
     cube = pd.concat([curve(name, [0.0] * 3, [0.0] * 3) for name in ("calql_b", "calql_c")]).assign(task="StackCube")
     write(results, "calql_stackcube", *(runs(name, [0.0] * 3, task="StackCube") for name in ("calql_b", "calql_c")), curves=cube)
+    found = verdicts.find(claim)  # Adroit, which F.3 explains, is judged alone
+    assert found.verdict == "reproduced" and found.tasks == "Door" and "not judged: StackCube" in found.measured
+    pen = cube.assign(task="Pen")
+    write(results, "calql", *(runs(name, ends, task=task) for task, two in (("Door", [0.96, 0.97, 0.98]), ("Pen", [0.0] * 3))
+                              for name, ends in (("calql_b", two), ("calql_c", two))), curves=pd.concat([*door, pen]))
     found = verdicts.find(claim)
-    assert found.verdict == "partly" and "StackCube 0.0 %" in found.measured and "not judged: StackCube" in found.measured
+    assert found.verdict == "partly" and "Pen 0.0 %" in found.measured and "Pen (all sides near 0)" in found.measured
 
 
 def test_three_seeds_are_asked_of_every_task():
@@ -341,15 +346,18 @@ def test_longer_runs_of_ppo_are_told_and_not_judged(results):
 def test_a_run_that_comes_back_in_between_was_relearned_and_one_that_falls_last_was_not_yet_tried(results):
     claim = CLAIMS.claim[CLAIMS.claim.str.startswith("Once unlearned")].item()
 
-    def found(*successes, recipe="sac_finetune", end=0.4):
-        lines = [pd.DataFrame({"task": "Door", "recipe": recipe, "seed": seed, "step": 1_000 * np.arange(1, 5), "success_once": successes})
-                 for seed in range(5)]
+    def found(*successes, recipe="sac_finetune", end=0.4, train=0.0):
+        lines = [pd.DataFrame({"task": "Door", "recipe": recipe, "seed": seed, "step": 1_000 * np.arange(1, 5), "success_once": successes,
+                               "train_success": train}) for seed in range(5)]
         write(results, "leaderboard", runs(recipe, [end] * 5), curves=pd.concat(lines))
         return (one.verdict, one.measured) if (one := verdicts.find(claim)) else None
 
-    assert found(0.0, 0.3, 0.4, 0.4) == ("reproduced", "5 of 5 unlearned runs never come back to their start")
-    assert found(0.0, 0.9, 1.0, 0.4) == ("not", "0 of 5 unlearned runs never come back to their start")
-    assert found(0.9, 0.0, 0.4, 0.4, end=0.5) == ("not", "0 of 5 unlearned runs never come back to their start")
+    met = "5 of 5 log no solved training episode any more"
+    assert found(0.0, 0.3, 0.4, 0.4) == ("reproduced", f"5 of 5 unlearned runs never come back to their start; {met}")
+    assert found(0.0, 0.9, 1.0, 0.4) == ("not", f"0 of 5 unlearned runs never come back to their start; {met}")
+    assert found(0.9, 0.0, 0.4, 0.4, end=0.5) == ("not", f"0 of 5 unlearned runs never come back to their start; {met}")
+    assert found(0.9, 0.0, 0.2, 0.2, train=[0.5, 0.0, 0.0, 0.1])[1].endswith("0 of 5 log no solved training episode any more")
+    assert found(0.9, 0.0, 0.2, 0.2, train=[0.5, 0.3, 0.0, 0.0])[1].endswith(met)  # solved before the loss, not after it
     assert found(0.9, 0.8, 0.9, 0.0) is None and found(0.0, 0.3, 0.4, 0.4, recipe="rot") is None
 
 
@@ -364,7 +372,7 @@ def test_a_fall_on_one_task_alone_is_no_fall_on_both(results):
 
 
 def test_residual_rl_early_and_late(results):
-    early, late = (CLAIMS.claim[CLAIMS.claim.str.startswith(f"Residual RL fails {when}")].item() for when in ("early", "later"))
+    early, late = (CLAIMS.claim[CLAIMS.claim.str.startswith(f"Residual RL fails {when}")].item() for when in ("early", "during"))
 
     def verdict_of(train, size, ends):
         rows = curve("residual_rl", ends, ends, train_success=train, residual_size=size, base_size=0.4).assign(step=lambda t: t.step / 2)
@@ -374,6 +382,8 @@ def test_residual_rl_early_and_late(results):
     assert verdict_of(0.0, 0.6, [0, 0.1, 0]) == ["reproduced", "reproduced"]
     assert verdict_of(0.0, 0.6, [0.9, 0.8, 0.9]) == ["reproduced", "partly"]  # larger, and yet no harm at the end
     assert verdict_of(0.6, 0.1, [0.9, 0.8, 0.9]) == ["not", "not"]
+    assert verdict_of(0.0, [0.6, 0.1], [0, 0.1, 0]) == ["reproduced", "partly"]  # larger at first, smaller at the end
+    assert "1.50 times mean |base action| in the first half, 0.25 times in the last quarter" in verdicts.find(late).measured
 
 
 def test_what_was_learned_offline_is_no_first_evaluation(results):
@@ -556,23 +566,22 @@ def test_novel_objects_and_the_mlp_below_them(results, ends, verdict):
     assert (mlp.tasks, mlp.verdict) == ("TurnFaucet", "reproduced" if min(ends) >= 0.8 else "not" if max(ends) < 0.5 else "partly")
     write(results, "base_policies", runs("mlp", [0.6] * 3))
     found = verdicts.find("Policy Decorator significantly improves an MLP base policy.")
-    assert found.tasks == "Door" and "; not judged: TurnFaucet mlp (best evaluation)" in found.measured
-    write(results, "base_policies", runs("mlp", [0.0] * 3, base=0.0))  # nothing to tell apart there: the main job does not stand in
-    assert verdicts.find("Policy Decorator significantly improves an MLP base policy.") is None
+    assert found.tasks == "TurnFaucet" and "; not judged: Door mlp 60.0 %" in found.measured  # the paper's task, by another sweep
+    write(results, "base_policies", runs("mlp", [0.6] * 3), runs("mlp", [0.7] * 3, task="TurnFaucet"))
+    found = verdicts.find("Policy Decorator significantly improves an MLP base policy.")
+    assert found.measured.startswith("mlp 70.0 %") and "not judged: Door +10.0" in found.measured
 
 
-@pytest.mark.parametrize("solved, verdict", [(0.9, "partly"), (0.5, "not")])
-def test_pictures_are_judged_by_one_run_and_never_reproduced(results, solved, verdict):
-    rows = [runs(recipe, [end], base=0.4, episodes=40, command="x") for recipe, end in (("pixels", solved), ("state", 0.1))]
-    write(results, "pixels", *rows)
-    found = verdicts.find("Policy Decorator improves base policies that see pictures as well")
-    assert found.verdict == verdict and f"from 40.0 % to {100 * solved:.1f} %" in found.measured and "Wilson" in found.interval
-    write(results, "pixels", *rows, runs("pixels", [0.9], base=0.4, episodes=40, command="y", task="TurnFaucet"))
-    found = verdicts.find("Policy Decorator improves base policies that see pictures as well")
-    assert found.verdict == "partly" and found.tasks == "TurnFaucet"  # a task of the paper's, whichever side the other is on
-    assert found.measured.startswith("TurnFaucet, one seed: from 40.0 % to 90.0 %; not judged: Door, one seed: from 40.0 %")
-    write(results, "pixels", *rows, runs("pixels", [0.35], base=0.4, episodes=40, command="y", task="TurnFaucet"))
-    assert verdicts.find("Policy Decorator improves base policies that see pictures as well").verdict == "not"
+def test_pictures_need_three_runs_like_anything_else(results):
+    claim = CLAIMS.claim[CLAIMS.claim.str.startswith("Policy Decorator improves base policies that see pictures")].item()
+    door = [runs(recipe, ends, base=0.4) for recipe, ends in (("pixels", [0.9]), ("state", [0.1] * 3))]
+    write(results, "pixels", *door, runs("pixels", [0.35], base=0.4, task="TurnFaucet"))
+    assert verdicts.find(claim) is None
+    [row] = verdicts.updated(CLAIMS[CLAIMS.claim == claim]).itertuples()
+    assert row.verdict == "untested" and row.measured.endswith("(runs): Door 40.0 % to 90.0 % (1), TurnFaucet 40.0 % to 35.0 % (1).")
+    for ends, verdict in (([0.9, 0.8, 0.85], "partly"), ([0.3, 0.2, 0.3], "not")):  # PushChair is the paper's, too
+        write(results, "pixels", *door, runs("pixels", ends, base=0.4, task="TurnFaucet"))
+        assert (verdicts.find(claim).verdict, verdicts.find(claim).tasks) == (verdict, "TurnFaucet")
 
 
 def test_all_tasks_with_nearly_all_success_are_lifted(results):
@@ -620,7 +629,7 @@ def test_unlearning_the_cube(results, success, lifted, verdicts_of):
     table = pd.DataFrame({"task": "StackCube", "seed": range(5), "success.before.value": [0.9, 1, 0.9, 1, 0.9], "lifted.before": 1.0,
                           "success.random critic, 100.value": success[0], "success.random critic, 200.value": success[1],
                           "lifted.random critic, 100": lifted[0], "lifted.random critic, 200": lifted[1],
-                          "cosine_random": [0.01, -0.02, 0, 0.03, -0.01], "drift.random critic": 0.1})
+                          "cosine_random": [0.01, -0.02, 0, 0.03, -0.01], "drift.random critic": 0.1, "drift.critic learns": 0.2})
     table.to_csv(results / "unlearning.csv", index=False)
     starts = ("After 100 updates", "After 200 updates", "Gradients of")
     found = [verdicts.find(CLAIMS.claim[CLAIMS.claim.str.startswith(start)].item()).verdict for start in starts]
@@ -666,7 +675,7 @@ def test_the_critics_architecture(results, mlp, others, ppo, expected):
     ends = {("sac", "mlp"): mlp, ("sac", "shared"): others, ("sac", "separate"): 0.1, ("ppo", "mlp"): 0.1, ("ppo", "shared"): 0.0,
             ("ppo", "separate"): ppo}
     tables = [runs(f"{m}_finetune,critic_backbone={k}", end + spread) for (m, k), end in ends.items()]
-    claims_of = starting("SAC fine-tuning with an MLP critic", "SAC fine-tuning with a critic on the shared", "PPO fine-tuning performs")
+    claims_of = starting("SAC fine-tuning with an MLP critic", "SAC fine-tuning with either of the two other", "PPO fine-tuning performs")
     write(results, "q_architectures", *tables)
     found = [verdicts.find(claim) for claim in claims_of]
     assert [f.verdict for f in found] == expected
@@ -694,7 +703,7 @@ def calql_results(results, ends, curves, minutes=None, load=2.0):
     ((0.5, 0.9), (0.4, 0.77), (0.1, 0.5), "partly", "not")])
 def test_negative_data_and_sac_online(results, a, b, c, negative, online):
     calql_results(results, {"calql_a": a[1], "calql_b": b[1], "calql_c": c[1]}, {"calql_a": a, "calql_b": b, "calql_c": c})
-    first, second = (verdicts.find(claim) for claim in starting("Cal-QL needs negative", "SAC in place of Cal-QL online costs"))
+    first, second = (verdicts.find(claim) for claim in starting("Cal-QL depends strongly", "SAC in place of Cal-QL online costs"))
     assert (first.verdict, second.verdict) == (negative, online)
     assert f"{100 * sum(a) / 2:.1f} %" in first.measured and f"C ends at {100 * c[1]:.1f} %" in second.measured
 
@@ -712,6 +721,49 @@ def test_what_cal_ql_saves_and_what_its_actor_is(results):
     assert found[3].command.count("data/sweeps/") == 2 and found[0].command == "pdkit sweep data/sweeps/leaderboard.toml"
     assert [f.verdict for f in verdicts_of(e=0.6, tuned=0.4, c=0.2, d=0.9, slower=1.1)] == ["not"] * 4
     assert [f and f.verdict for f in verdicts_of(e=0.6, tuned=0.4, c=0.2, d=0.9, slower=1.1, load=4.0)] == ["not", None, "not", "not"]
+
+
+def test_where_cal_ql_loses_and_what_its_queries_cost(results):
+    """A above E on Adroit; and an update with a transformer for an actor against one of SAC."""
+    gap, cost, slower = starting("The difference between Cal-QL's published", "Querying the actor", "SAC in place of Cal-QL online saves")
+    for e, verdict in ((0.1, "reproduced"), (0.95, "not")):
+        calql_results(results, {"calql": e, **{f"calql_{letter}": 0.8 for letter in "abcd"}}, {"calql_b": (0.1, 0.2)})
+        found = verdicts.find(gap)
+        assert (found.verdict, found.tasks) == (verdict, "Door") and f"C 80.0 %, D 80.0 %, E {100 * e:.1f} %" in found.measured
+        assert found.command.endswith("pdkit sweep data/sweeps/leaderboard.toml")
+    assert "4 sampled actions of each kind" in verdicts.find(slower).measured
+    for ratio, verdict in ((3.0, "reproduced"), (1.5, "not")):
+        seconds = {"seconds.transformer.Cal-QL": 0.1 * ratio, "seconds.transformer.SAC": 0.1, "seconds.small MLP.Cal-QL": 1.2,
+                   "seconds.small MLP.SAC": 0.1}
+        rows = pd.DataFrame([{"task": "Door", "recipe": "calql_losses", "seed": seed, "command": "x"} | seconds for seed in range(3)])
+        write(results, "calql_losses", rows)
+        assert verdicts.find(cost).verdict == verdict and f"{ratio:.2f} times" in verdicts.find(cost).measured
+        assert "12.0 times where it is a small MLP" in verdicts.find(cost).measured
+
+
+def test_cal_ql_is_judged_on_adroit_where_it_was_run(results):
+    """F.3 explains results there; StackCube stands beside it."""
+    [claim] = starting("Cal-QL depends strongly")
+    lines = pd.concat([curve("calql_a", [0.9] * 3, [0.9] * 3), curve("calql_b", [0.2] * 3, [0.2] * 3)])
+    write(results, "calql", runs("calql_a", [0.9] * 3), runs("calql_b", [0.2] * 3), curves=lines)
+    cube = pd.concat([curve("calql_a", [0.1] * 3, [0.1] * 3), curve("calql_b", [0.9] * 3, [0.9] * 3)]).assign(task="StackCube")
+    write(results, "calql_stackcube", *(runs(f"calql_{letter}", [0.5] * 3, task="StackCube") for letter in "ab"), curves=cube)
+    found = verdicts.find(claim)
+    assert (found.verdict, found.tasks) == ("reproduced", "Door") and "not judged: StackCube -80.0" in found.measured
+
+
+def test_versatile_is_every_kind_and_a_backbone_is_compared_by_its_way(results):
+    versatile, backbone = starting("Policy Decorator is versatile", "SAC is a more sample-efficient")
+    mlp, cnn = (runs(name, [0.9, 0.8, 0.85], task="StackCube", base=0.4) for name in ("mlp", "cnn"))
+    for third, verdict in (([0.6, 0.7, 0.65], "reproduced"), ([0.3, 0.2, 0.3], "partly"), ([0.9], "reproduced")):
+        write(results, "base_policies", mlp, cnn, runs("diffusion", third, task="StackCube", base=0.4))
+        assert verdicts.find(versatile).verdict == verdict
+    write(results, "base_policies", mlp)
+    assert verdicts.find(versatile) is None
+    for sac, verdict in (([0.8, 0.9, 0.85], "reproduced"), ([0.1, 0.2, 0.1], "not")):
+        lines = pd.concat([curve("policy_decorator", sac, sac), curve("ppo_decorator", [0.4, 0.5, 0.4], [0.4, 0.5, 0.4])])
+        write(results, "leaderboard", runs("policy_decorator", [0.9] * 3), runs("ppo_decorator", [0.9] * 3), curves=lines)
+        assert verdicts.find(backbone).verdict == verdict
 
 
 def test_what_a_lesson_cannot_reach_stays_untested():
@@ -782,7 +834,7 @@ def test_a_warm_start_is_judged_at_equal_ages_of_the_actor(results, late, verdic
 def test_a_warm_start_explodes_where_the_critics_loss_does_on_every_task(results, stack, others, verdict):
     claim = CLAIMS.claim[CLAIMS.claim.str.startswith("Warm-starting the critic makes")].item()
     usual = {"runs.warm.temperature": 2.8, "runs.vanilla.temperature": 1.0, "runs.warm.loss": 100.0, "runs.vanilla.loss": 5.0,
-             "runs.warm.q": 120.0, "runs.vanilla.q": 30.0, "rewards_alone": 50.0}
+             "runs.fixed.loss": 20.0, "runs.warm.q": 120.0, "runs.vanilla.q": 30.0, "rewards_alone": 50.0}
     for name, task, changed in (("warm_start", "Door", others), ("warm_start_stackcube", "StackCube", others | stack)):
         write(results, name, pd.DataFrame({"task": task, "recipe": "x", "seed": range(3)} | usual | changed))
     found = verdicts.find(claim)
@@ -803,7 +855,7 @@ def test_random_gradients_that_point_apart_on_two_tasks_are_no_noise(results):
     claim = CLAIMS.claim[CLAIMS.claim.str.startswith("Gradients of a randomly")].item()
     for cosine, verdict in ((0.05, "reproduced"), (0.6, "not")):
         write(results, "unlearning", pd.DataFrame({
-            "task": ["Door"] * 3 + ["StackCube"] * 3, "seed": [0, 1, 2] * 2, "drift.random critic": 0.1,
+            "task": ["Door"] * 3 + ["StackCube"] * 3, "seed": [0, 1, 2] * 2, "drift.random critic": 0.1, "drift.critic learns": 0.2,
             "cosine_random": [cosine, cosine + 0.01, cosine - 0.01] + [-cosine] * 3}))
         assert verdicts.find(claim).verdict == verdict
 
@@ -896,8 +948,15 @@ def test_a_method_with_one_seed_on_a_task_is_not_judged_there(results):
 
 def test_dppo_is_compared_on_other_tasks_than_the_papers(results):
     claim = CLAIMS.claim[CLAIMS.claim.str.startswith("Policy Decorator on DPPO")].iloc[0]
-    for dppo, verdict in (([0.5, 0.55, 0.6], "partly"), ([0.9, 0.95, 0.99], "not")):
-        write(results, "diffusion_finetuning", runs(OWN, [0.8, 0.82, 0.85], task="StackCube"), runs("dppo", dppo, task="StackCube"))
-        assert verdicts.find(claim).verdict == verdict
+    tunes = CLAIMS.claim[CLAIMS.claim.str.startswith("DPPO successfully fine-tunes")].item()
+    for dppo, verdict, tuned in (([0.5, 0.55, 0.6], "partly", "partly"), ([0.9, 0.95, 0.99], "not", "partly"),
+                                 ([0.3, 0.31, 0.32], "partly", "not")):
+        for other in ("dppo,lora=8", "dppo"):  # the better of both settings counts
+            mine = next(name for name in ("dppo,lora=8", "dppo") if name != other)
+            write(results, "diffusion_finetuning", runs(OWN, [0.8, 0.82, 0.85], task="StackCube", base=0.4),
+                  runs(mine, dppo, task="StackCube", base=0.4), runs(other, [0.1, 0.1, 0.1], task="StackCube", base=0.4))
+            found = [verdicts.find(each) for each in (claim, tunes)]
+            assert [each.verdict for each in found] == [verdict, tuned]
+            assert all(mine in each.measured and f"beside them {other} 10.0 %" in each.measured for each in found)
     write(results, "diffusion_finetuning", runs(OWN, [0.8], task="StackCube"), runs("dppo", [0.1], task="StackCube"))
     assert verdicts.find(claim) is None

@@ -42,7 +42,7 @@ from .registry import EIGHT, measures
 
 # The paper's baselines over Diffusion Policy, but for JSRL, whose guide acts in single steps here (methods/jsrl.py).
 TUNED, KEPT = ("dipo",), ("residual_rl", "fish")
-BESIDES = ("dppo",)  # fine-tunes, too, but is none of Fig. 1's
+BESIDES = ("dppo", "dppo,lora=8")  # fine-tunes, too, but is none of Fig. 1's; with all weights, and with adapters
 COLUMNS = ["task", "recipe", "seed", "base_success", "decorated_success"]
 
 
@@ -104,8 +104,21 @@ def _() -> Finding:
 
 @measures("Policy Decorator on DPPO's own diffusion checkpoints")
 def _() -> Finding:
-    """Significantly: the whole interval of the lead lies above 0. On other tasks than the paper's, so partly at most."""
+    """Significantly: the whole interval of the lead lies above 0, against the better of DPPO's recorded settings, as the paper's was
+    carefully tuned (at first the plain one alone was judged, and the verdict was "partly"). On other tasks than the paper's, so partly at
+    most."""
     records, table, cells = _recorded()
-    one, two = (by_seed(table, recipe, "decorated_success") for recipe in (DECORATOR, "dppo"))
-    found = set_against(records, one, two, (DECORATOR, "dppo"), paper=("Square", "Transport"))
-    return replace(found, measured=found.measured + cells)
+    rival = best(table, BESIDES)
+    one, two = (by_seed(table, recipe, "decorated_success") for recipe in (DECORATOR, rival))
+    found = set_against(records, one, two, (DECORATOR, rival), paper=("Square", "Transport"))
+    return replace(found, measured=found.measured + cells + besides(table, [recipe for recipe in BESIDES if recipe != rival]))
+
+
+@measures("DPPO successfully fine-tunes")
+def _() -> Finding:
+    """Above the policy that it started from, at the better of its recorded settings. Not the paper's tasks, nor their budget."""
+    records, table, _ = _recorded()
+    rival = best(table, BESIDES)
+    end, start = (by_seed(table, rival, column) for column in ("decorated_success", "base_success"))
+    found = set_against(records, end, start, (rival, "its start"), paper=("Square", "Transport"))
+    return replace(found, measured=found.measured + besides(table, [recipe for recipe in BESIDES if recipe != rival]))
