@@ -120,9 +120,8 @@ def errors(policy: Policy, encoder: Encoder, demos: Demos, pictures: Pictures) -
 
 
 def verdict(row: pd.Series) -> str:
-    """The claim that visual policies are improved too (Fig. 8), judged by one recorded row, with the rule made beforehand: "partly" if
-    Wilson's 95 % interval of the decorated success lies above the base's success, "not" otherwise. Never "reproduced": that would take
-    three seeds and the paper's tasks, TurnFaucet and PushChair.
+    """Whether a visual policy was improved (Fig. 8), judged by one recorded row, with the rule made beforehand: "partly" if Wilson's 95 %
+    interval of the decorated success lies above the base's success, "not" otherwise. Never "reproduced", as one run is no test.
     """
     rate = wilson(round(row.decorated_success * row.episodes), int(row.episodes))
     return "partly" if rate.low > row.base_success else "not"

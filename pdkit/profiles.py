@@ -19,7 +19,9 @@ from .tasks import TASKS, get_task
 
 PROFILES = ("smoke", "lesson", "paper")
 
-# The paper's code for the BeT base (facts.md 1.3): Table 9 is blank in the paper, so the official defaults stand in for it.
+# The paper's code for the BeT base (facts.md 1.3): Table 9 is blank in our copy, so the official defaults stand in for it.
+# They are ManiSkill's script's. That Adroit's episodes end at success, too, for a reward of 0 or 1, is ours: the paper's rule is not known
+# (gymnasium's Adroit never ends, and gives 10 or -0.1). Updates come in smaller bursts than the script's 16 every 64 steps.
 _PAPER: dict[str, Any] = dict(
     total_steps=3_000_000, num_envs=16, warmup_steps=8_000, warmup="uniform", utd=0.25, batch=1024, demo_fraction=0.0, n_step=1,
     gamma=0.97, reward_shift=-1.0, on_success="terminate", bootstrap="truncated", normalize_obs=False, lr_decay_from=1.0,

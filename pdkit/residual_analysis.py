@@ -1,8 +1,8 @@
 """Why residual RL and FISH fail, or do not: the measurements of notebook 11 (appendix G).
 
     stray       distance of the hand from where the base policy alone has it, at the same step from the same seed (m)
-    late ratio  mean |residual| / mean |base action| over the last quarter of a run, as executed
-    lookup      success of nearest neighbours by features, k and exclusion buffer (Tables 11 to 13, which are blank in the paper)
+    size ratio  mean |residual| / mean |base action| over the last quarter of a run (or another part), as executed
+    lookup      success of nearest neighbours by features, k and exclusion buffer (Tables 11 to 13, whose numbers our copy lacks)
     transport   what FISH's reward gives a whole episode, and whether it tells solved episodes from failed ones
 
 A verdict is a function of measured numbers, so that another run may come to another one.

@@ -32,7 +32,7 @@ SUITES = ("maniskill", "adroit")
 DIFFUSION = {"diffusion_finetuning": "policy_decorator,alpha=0.03", "diffusion_door": "policy_decorator",
              "diffusion_tasks": "policy_decorator"}
 COLD = {"Relocate": 0.5}  # bases among them that start from this much of the noise (`temperature`): none of the paper's kind
-PAPER_DIFFUSION = (52.55, 99.9)  # percent, the mean over six tasks (Fig. 1): base policy, decorated
+PAPER_DIFFUSION = (52.55, 99.9)  # percent (Fig. 1), the mean over six tasks, as its axes let infer: base policy, decorated
 COLUMNS = ["task", "suite", "policy", "demos", "label", "seeds", "episodes", "env_steps", "base", "base_low", "base_high", "decorated",
            "low", "high", "at_end"]
 ENOUGH = 3  # seeds below which the interval is the test episodes' alone

@@ -6,7 +6,8 @@ learning rates 1e-4 and 1e-3, gamma 0.999, lambda 0.95, 10 epochs, no clipping o
 profile alone: the lesson makes 5 epochs and has its task's gamma (a chunk's is 0.922 on StackCube, 0.941 on Door). Where DPPO samples a
 U-Net by DDIM, as here, it fine-tunes all 5 of 5 steps: so do we, all 4. There it takes a clip of 0.001, a discount of 0.9, a std of 0.04,
 and for the policy a learning rate of 1e-5, a tenth of ours (in the recorded runs half and more of the ratios lie outside the clip); V's
-rate stays where it is, ours falls to a tenth.
+rate stays where it is, ours falls to a tenth. It collects in 50 environments, 10,000 transitions a minibatch; the paper profile here has 16
+and divides its rollout of 400 decisions each into as many minibatches (1,280 rows), the lesson far fewer.
 
 As in its code the fine-tuned steps have a copy of the network (`late` of pdkit/policies/diffusion.py, saved with the policy), and all its
 weights train (`lora` 0; another rank trains adapters). Not as there, beside what ppo.py says of rewards and advantages: V does not

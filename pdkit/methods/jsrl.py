@@ -12,7 +12,7 @@ rates of 6e-4 and 1e-3 on Door and 3e-4 on StackCube; paper 1,024, 1 step and 1e
 improvement never blocks, and while it is 0 nothing falls: doing equally badly is no progress. Rows hold the executed action, whoever
 chose it, and base = 0: the critics value actions, not corrections. The result is the combination at its final h, which the rows
 call `guide_steps`: if h never reached 0, the base policy is still part of it. Training waits for each evaluation, because the
-next episode depends on it.
+next episode depends on it. The guide acts in single steps: over a Diffusion Policy it needs one with chunk=1.
 """
 from __future__ import annotations
 

@@ -55,7 +55,8 @@ class BeTForSAC(BeT):
 
     @classmethod
     def for_task(cls, spec: TaskSpec) -> dict[str, Any]:
-        """The paper's scale: 0.5 for every Adroit joint, 0.3 for a ManiSkill gripper, which is the last dimension."""
+        """The paper's scale: 0.5 for every Adroit joint, 0.3 for the last dimension on ManiSkill, a gripper's (PushChair's other one, 11,
+        stays unscaled as there; give `scale` to change that)."""
         return {"scale": [0.5] * spec.act_dim if spec.suite == "adroit" else [1.0] * (spec.act_dim - 1) + [0.3]}
 
     def _add_lora(self, rank: int) -> None:

@@ -5,7 +5,8 @@
     separate   Q(g(w), a)   g a transformer of its own, which starts as the actor's does
 
 Features are those that the actor's heads read: the transformer's output at the last position. PPO's value function has no action.
-The paper names the three and says no more. What follows is ours:
+The page that lists the three is missing in our copy: of the other two it leaves "a separate GPT backbone" to read, and that the second
+shares the actor's is our reading. What follows is ours, too:
 
     both Q      are heads on one transformer: their difference is the heads' alone, and a second transformer would double the cost
     adapters    the critic's transformer trains what the actor's does: the adapters on attention, or all weights with lora = 0

@@ -68,7 +68,8 @@ def _on_bet(kind: str = "") -> pd.DataFrame:
 
 def _lifted(suites: tuple[str, ...]) -> Finding:
     """Lifted: more success than the base policy, and NEARLY all on average, over the tasks with three seeds whose base policy is a BeT.
-    What was recorded on the others (some of ManiSkill's base policies here are MLPs, and some have one seed) is told beside it."""
+    What was recorded on the others (some of ManiSkill's base policies here are MLPs, and some have one seed) is told beside it. Success is
+    that of any step of an episode; which one the paper counts on Adroit, it does not say."""
     records = ("main_job", "bet_bases")
     table, bets = recorded(records[0])[0], pd.DataFrame()
     with contextlib.suppress(TooLittle):
