@@ -55,7 +55,7 @@ def range_figure(tasks: pd.DataFrame, means: pd.DataFrame, title: str = "", pape
 def over_diffusion_figure(tasks: pd.DataFrame) -> Picture:
     """The same of `task_range.over_diffusion`."""
     return range_figure(tasks, averages(tasks, {"all": PAPER_DIFFUSION}), "Over a Diffusion Policy, the last policy of a run",
-                        "what seem to be six tasks")
+                        "what seem to be six tasks, not named")
 
 
 @styled

@@ -71,7 +71,7 @@ def test_what_is_recorded_over_a_diffusion_policy(results):
     assert two["base"] == pytest.approx(0.65) and two["base_high"] - two["base_low"] < row["base_high"] - row["base_low"]
     figure = plots_range.over_diffusion_figure(pd.DataFrame([two]))
     (ax,) = figure.axes
-    assert figure.legends[0].get_texts()[-1].get_text() == "the paper's mean, six tasks that it does not name"
+    assert figure.legends[0].get_texts()[-1].get_text() == "the paper's mean, what seem to be six tasks, not named"
     assert [label.get_text() for label in ax.get_yticklabels()] == ["StackCube (2 seeds)", "mean, 1 of 1 tasks"]
     assert [float(np.ravel(line.get_xdata())[0]) for line in ax.lines if line.get_marker() == "s"] == pytest.approx([0.5255, 0.999])
 
