@@ -552,8 +552,8 @@ def test_a_notebook_is_run_with_each_value_and_its_result_becomes_a_row(tmp_path
     try:
         nbformat.write(nbformat.v4.new_notebook(cells=cells), path)
         spec = written(tmp_path, **BOOK | {"fixed": {"notebook": name, "list": [2, 3]}, "grid": {"word": ["a b", "1"]}, "seeds": [4],
-                                           "cells": [{"word": "c", "recipe": "c"}]})
-        assert cli.main(["sweep", str(spec)]) == 2  # a blank in a name
+                                           "cells": [{"word": "c", "recipe": "c d"}]})
+        assert cli.main(["sweep", str(spec)]) == 2  # a blank in a name that was given
         spec = written(tmp_path, **BOOK | {"fixed": {"notebook": name, "list": [2, 3]}, "grid": None, "seeds": [4],
                                            "cells": [{"word": "a b", "recipe": "ab"}, {"word": "broken", "recipe": "bad"},
                                                      {"word": "1", "recipe": "one"}]})
