@@ -225,7 +225,7 @@ def test_ablations(tmp_path):
     result = run("13", tmp_path, alpha=0.3, critic_input="concat")
     assert result["recipe"] == "alpha=0.3,H=0,critic_input=concat,residual_units=bound"
     assert result["env_steps"] >= 600 and result["episodes"] == 2
-    assert result["scales"]["mean |a_t - a_(t-1)|"] == pytest.approx(0.111, abs=0.001) and len(result["claims"]) == 11
+    assert result["scales"]["mean |a_t - a_(t-1)|"] == pytest.approx(0.111, abs=0.001) and len(result["claims"]) == 12
     assert (tmp_path / "grid_curves.png").exists() and result["exercise_solved"] is False
 
 
@@ -292,7 +292,7 @@ def test_other_base_policies(tmp_path):
     assert set(result["curves"]) == set(result["chosen"]) == {"MLP", "CNN"} and all(len(c) == 2 for c in result["curves"].values())
     assert set(result["parameters"]) == {"MLP", "BC-RNN", "CNN", "BeT", "Diffusion Policy"} and result["ms_step"]["MLP"] > 0
     assert result["doubtful"]["Door"] < result["doubtful"]["StackCube"] and result["two_groups"]["StackCube"] > 0.9
-    assert all(set(rates) == {"2"} for rates in result["neighbours"].values()) and len(result["claims"]) == 4
+    assert all(set(rates) == {"2"} for rates in result["neighbours"].values()) and len(result["claims"]) == 5
     assert (tmp_path / "gains.png").exists() and result["exercise_solved"] is False
 
 
@@ -301,7 +301,7 @@ def test_finetuning_diffusion(tmp_path):
     assert set(result["reached"]) == {"a slope", "a plateau"} and result["adapters"]["8"] < result["adapters"]["0"] == 1_201_796
     passes = {name: cost["passes"] for name, cost in result["costs"].items()}
     assert passes["Policy Decorator"] == 0 < passes["DPPO"] == 1 < 4 < passes["DIPO"] < 5
-    assert result["own"]["method"] == "dipo" and result["own"]["steps"] >= 600 and len(result["claims"]) == 4
+    assert result["own"]["method"] == "dipo" and result["own"]["steps"] >= 600 and len(result["claims"]) == 5
     assert result["own"]["verdicts"].keys() == {"success", "success_at_end"} and (tmp_path / "costs.csv").exists()
     assert result["exercise_solved"] is False
 
