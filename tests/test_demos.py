@@ -57,12 +57,22 @@ def test_a_safetensors_file_of_something_else_is_refused(tmp_path):
 @pytest.mark.parametrize(("change", "says"), [
     (dict(task="Pen"), "shape"), (dict(label="robot"), "label"), (dict(actions=np.full((14, 28), 2.0, np.float32)), "outside"),
     (dict(observations=np.full((16, 39), np.nan, np.float32)), "NaN"), (dict(success=np.zeros(3, bool)), "success"),
-    (dict(seeds=np.zeros(5, np.int64)), "seeds"), (dict(seeds=np.array([0, 10**6])), "1,000,000 to 2,999,999"),
-    (dict(lengths=np.array([14, 0])), "empty"), (dict(task="Doors"), "Unknown task"),
+    (dict(seeds=np.zeros(5, np.int64)), "seeds"), (dict(lengths=np.array([14, 0])), "empty"), (dict(task="Doors"), "Unknown task"),
 ])
 def test_wrong_contents(demos, change, says):
     with pytest.raises(PdkitError, match=says):
         validate(dataclasses.replace(demos, **change))
+
+
+def test_episodes_of_the_tests_become_no_file_of_demonstrations(demos, tmp_path):
+    for seed, allowed in ((999_999, True), (1_000_000, False), (2_999_999, False), (3_000_000, True)):
+        mine, path = dataclasses.replace(demos, seeds=np.array([0, seed])), tmp_path / f"{seed}.safetensors"
+        if allowed:
+            save_demos(mine, path)
+        else:
+            with pytest.raises(PdkitError, match="a seed from 1,000,000 to 2,999,999"):
+                save_demos(mine, path)
+        assert path.exists() == allowed
 
 
 @pytest.mark.parametrize("num", [0, 3])

@@ -105,8 +105,6 @@ def validate(demos: Demos, where: str = "demonstrations", spec: TaskSpec | None 
          f"actions have shape {demos.actions.shape}, {spec.name} needs {(total, spec.act_dim)}"),
         (demos.success.shape != (total,), f"success has shape {demos.success.shape}, not {(total,)}"),
         (demos.seeds.shape != (num,), f"seeds have shape {demos.seeds.shape}, not {(num,)}"),
-        (((demos.seeds >= TEST) & (demos.seeds < ROLLOUT)).any(), f"an episode has a seed from {TEST:,} to {ROLLOUT - 1:,}, and these are "
-         "for testing and for choosing policies"),
         (not np.isfinite(demos.observations).all() or not np.isfinite(demos.actions).all(), "a number is NaN or infinite"),
         (demos.actions.size > 0 and float(np.abs(demos.actions).max(initial=0)) > 1.0 + 1e-6, "an action lies outside [-1, 1]"),
     ]
@@ -117,10 +115,16 @@ def validate(demos: Demos, where: str = "demonstrations", spec: TaskSpec | None 
 
 
 def save_demos(demos: Demos, path: str | Path) -> None:
-    """Write `demos` to `path` (.safetensors), atomically."""
+    """Write `demos` to `path` (.safetensors), atomically.
+
+    Raises PdkitError, too, for episodes with seeds of the tests or of choosing policies: what learned from them would be tested on them.
+    """
     from safetensors.numpy import save_file
 
     validate(demos)
+    if ((demos.seeds >= TEST) & (demos.seeds < ROLLOUT)).any():
+        raise PdkitError(f"An episode has a seed from {TEST:,} to {ROLLOUT - 1:,}, and these are for testing and for choosing policies; "
+                         "make demonstrations from others.")
     card = {"format": FORMAT, "task": demos.task, "label": demos.label, "how": demos.how, "command": demos.command,
             "checksum": demos.checksum, "extra": demos.extra}
     arrays = {name: np.ascontiguousarray(getattr(demos, name), dtype) for name, dtype in _DTYPES.items()}
