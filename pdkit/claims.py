@@ -273,8 +273,8 @@ def compared(record: str, first: str, second: str = "", *, column: str = "decora
 
 
 def set_against(record: str | Sequence[str], one: pd.Series, two: pd.Series, names: tuple[str, str], *, sign: int = 1, enough: float = 0.0,
-                paper: Sequence[str] = ()) -> Finding:
-    """The same for runs by (task, seed), from wherever; `names` says what both are called."""
+                paper: Sequence[str] = (), recipes: Collection[str] = ()) -> Finding:
+    """The same for runs by (task, seed), from wherever; `names` says what both are called, `recipes` which of the record were looked at."""
     one, two = matched(one, two)
     chosen, others = named_by(paper, _of_enough_seeds(one))
     rest = (one - two).loc[others.index]
@@ -282,7 +282,7 @@ def set_against(record: str | Sequence[str], one: pd.Series, two: pd.Series, nam
     interval, values = difference(one, two)
     told = (f"{names[0]} {percent(average(one))}, {names[1]} {percent(average(two))}: {signed(interval.value)} points"
             f"{task_by_task(values, signed)}{not_judged(near_0, rest.groupby(level='task').mean().to_dict())}")
-    return finding(record, values, told, points(interval), judged_over_tasks(sign * values, enough), paper)
+    return finding(record, values, told, points(interval), judged_over_tasks(sign * values, enough), paper, recipes=recipes)
 
 
 def ahead(record: str | Sequence[str], table: pd.DataFrame, own: str, kinds: Mapping[str, Sequence[str]], paper: Sequence[str],

@@ -145,9 +145,10 @@ def run_notebook(name: str, parameters: dict[str, Any] | None, out: str | Path, 
     """
     from .nb_run import execute
 
-    path, values, out = find_notebook(name), checked_parameters(name, parameters or {}), Path(out).resolve()
-    write_json(folder(out) / "parameters.json", values)  # finds out now whether the folder can be written
+    out = Path(out).resolve()
     (out / RESULT).unlink(missing_ok=True)
+    path, values = find_notebook(name), checked_parameters(name, parameters or {})
+    write_json(folder(out) / "parameters.json", values)  # finds out now whether the folder can be written
     try:
         execute(path, {**values, "out": str(out)}, out, timeout, progress)
     except BaseException:  # Ctrl-C, too: a notebook that wrote its result and then failed did not come to its end

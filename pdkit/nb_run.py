@@ -61,7 +61,7 @@ def execute(path: Path, values: dict[str, Any], out: Path, timeout: float | None
                 resources={"metadata": {"path": str(path.parent)}},  # the kernel's folder, as in JupyterLab
             )
     except papermill.PapermillExecutionError as error:
-        raise PdkitError(f"Notebook {path.stem} failed in cell {watch.index + 1} ({error.ename}: "
+        raise PdkitError(f"Notebook {path.stem} failed in cell {watch.index + 1} ({_one_line(error.ename)}: "
                          f"{_one_line(error.evalue)}); the traceback is in {output}.") from None
     except CellTimeoutError:
         raise _kept(output, watch, "TimeoutError", f"did not finish within {timeout:g} s") from None

@@ -3,10 +3,13 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import hashlib
+import itertools
+import json
 import re
 import shlex
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -24,15 +27,17 @@ from .tasks.partnet import object_set
 
 KEYS = ["task", "recipe", "seed"]  # a row with the same ones is replaced
 TRAINING = "pdkit train decorated"  # how a command that makes a row of a training begins
-SETTINGS = "settings"  # the column that tells rows of other settings apart: the beginning of a checksum (sweep_run.Job.settings)
+SETTINGS = "settings"  # the column that tells rows of other settings apart: a `mark`, whose settings the manifest holds
 OTHER_BASE = re.compile(r",base=[^,]*")  # in the recipe of a method that starts from another policy than its own
 OWN = ",partnet"  # behind the recipe of a row on the user's own objects
 
 
-def record(name: str, rows: pd.DataFrame, curves: pd.DataFrame) -> None:
+def record(name: str, rows: pd.DataFrame, curves: pd.DataFrame, settings: Mapping[str, dict[str, Any]] | None = None) -> None:
     """Add rows to data/results/NAME.csv and, where there are curves, NAME_curves.csv, and draw a picture a task of trainings.
 
     Numbers keep six significant digits, those of curves four: more than is drawn, and the repository stays small.
+
+    `settings` are those of the rows by their mark (column SETTINGS); the manifest keeps them.
 
     The manifest tells how to make all of it again (the column `sweep` of rows that have one, else `command`) and which machines have
     recorded here, this one last; a row's `cores` hint at which of them made it, and its `commit` is that of its own run. On the user's
@@ -48,12 +53,15 @@ def record(name: str, rows: pd.DataFrame, curves: pd.DataFrame) -> None:
                 continue
             tables.append(_merged(path, new))
             if not tables[1:]:
-                print(*(f"{sentence}\n" for sentence in mixed(name, tables[0])), sep="", end="", flush=True)
+                every = settings_of(name) | dict(settings or {})
+                known = {of: told for of, told in every.items() if of in set(tables[0].get(SETTINGS, []))}
+                print(*(f"{sentence}\n" for sentence in mixed(name, tables[0], known)), sep="", end="", flush=True)
             with atomic_file(path) as temporary:
                 _whole(tables[-1]).to_csv(temporary, index=False, float_format=f"%.{digits}g")
         again = tables[0]["sweep"].fillna(tables[0].command) if "sweep" in tables[0] else tables[0].command
         path = folder / f"{name}_manifest.json"
-        write_json(path, {"written": time.strftime("%Y-%m-%d"), "machines": _machines(path), "again": sorted(set(again))})
+        write_json(path, {"written": time.strftime("%Y-%m-%d"), "machines": _machines(path), "again": sorted(set(again))}
+                   | ({SETTINGS: known} if known else {}))
         if len(tables) < 2 or not {"base_success", "decorated_success"} <= set(tables[0]):
             return
         for task in dict.fromkeys(tables[0].task):  # all: which is the first may have changed
@@ -67,15 +75,33 @@ def picture_of(name: str, task: str, table: pd.DataFrame) -> str:
     return name if task == first else f"{name}-{task}"
 
 
-def mixed(name: str, table: pd.DataFrame) -> list[str]:
-    """A sentence for each recipe of the table NAME whose rows, seeds aside, were not made alike: no mean over them says anything."""
-    def made(command: str) -> str:
-        return str([part for part in essence(command) if not part.startswith("seeds ")])
+def mark(settings: Mapping[str, Any]) -> str:
+    """What a row calls its settings: s and twelve digits of their checksum."""
+    return f"s{hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:12]}"
 
-    decorated = table[table.command.str.startswith(TRAINING)]
-    alike = [decorated.assign(made=decorated.command.map(made))]
-    alike += [table[table[SETTINGS].notna()].assign(made=lambda rows: rows[SETTINGS])] if SETTINGS in table else []
-    found = dict.fromkeys(key for rows in alike for key, ways in rows.groupby(["task", "recipe"]).made if ways.nunique() > 1)
+
+def settings_of(name: str, folder: Path | None = None) -> dict[str, dict[str, Any]]:
+    """The settings of the rows of data/results/NAME by their marks, as its manifest has them."""
+    path = (folder or DATA / "results") / f"{name}_manifest.json"
+    return read_json(path).get(SETTINGS, {}) if path.exists() else {}
+
+
+def unlike(one: Mapping[str, Any], other: Mapping[str, Any]) -> list[str]:
+    """The settings, of those that both have, in which they differ: a field that one has not is newer than the run, and was not there."""
+    return sorted(name for name in one.keys() & other.keys() if one[name] != other[name])
+
+
+def mixed(name: str, table: pd.DataFrame, settings: Mapping[str, dict[str, Any]]) -> list[str]:
+    """A sentence for each recipe of the table NAME whose rows, seeds aside, were not made alike: no mean over them says anything. Rows that
+    tell no settings (by their mark) are held to their commands."""
+    def differ(rows: pd.DataFrame) -> bool:
+        marked = [settings[each] for each in rows[SETTINGS].dropna().unique() if each in settings] if SETTINGS in rows else []
+        silent = rows[rows[SETTINGS].isna()] if SETTINGS in rows else rows
+        ways = {tuple(part for part in essence(command) if not part.startswith(("seeds ", "num-demos ")))
+                for command in silent.command if command.startswith(TRAINING)}
+        return len(ways) > 1 or any(unlike(one, other) for one, other in itertools.combinations(marked, 2))
+
+    found = [key for key, rows in table.groupby(["task", "recipe"]) if differ(rows)]
     return [f"{name}.csv: the rows of {task} {recipe} were run with different settings; run the older ones again "
             "(`pdkit sweep SPEC --missing` tells which), or record under another name." for task, recipe in found]
 

@@ -29,7 +29,7 @@ from .cli import Parser
 from .errors import PdkitError
 from .files import DATA, TEMPORARY, atomic_file, runs_root
 from .plots import Picture, save_small
-from .recorded import KEYS, mixed, of_these_objects, picture_of
+from .recorded import KEYS, mixed, of_these_objects, picture_of, settings_of
 
 COLUMNS = ["claim", "section", "tasks", "seeds", "measured", "interval", "verdict", "command"]
 VERDICTS = {"reproduced": "what the paper says was found", "partly": "found in part, or not yet with certainty",
@@ -100,7 +100,7 @@ def table_problems(name: str, table: pd.DataFrame, folder: Path) -> list[str]:
     found = []
     if (count := int(table.duplicated(KEYS).sum())):
         found.append(f"{name}.csv has {count} rows more than once (same {', '.join(KEYS)}).")
-    found += mixed(name, table)
+    found += mixed(name, table, settings_of(name, folder))
     for column in RATES:
         if column in table and not table[column].between(0, 1).all():
             found.append(f"{name}.csv has a {column} that is no rate between 0 and 1.")

@@ -106,7 +106,7 @@ class Run:
             if not self.finished:
                 if (machine := describe_machine()) != machines(self.manifest)[-1]:
                     self.manifest.setdefault("resumed", []).append({"at": _now(), "machine": machine})
-                self.manifest["code"] = code_checksum()
+                self.manifest["code"] = list(dict.fromkeys([*self.manifest.get("code", ()), code_checksum()]))
                 self._write_manifest()
             yield
 
@@ -116,12 +116,12 @@ class Run:
 
     def finish(self, **results: Any) -> None:
         """Mark the run complete and store its results in the manifest."""
-        self.manifest |= {"finished": _now(), "results": results}
+        self.manifest |= {"finished": self.manifest["finished"] or _now(), "results": results}
         self._write_manifest()
 
     def already(self) -> str:
         """That a finished run is not trained again, and what to do for that, in a sentence."""
-        changed = ", and the kit's code has changed since" if self.manifest.get("code") not in (None, code_checksum()) else ""
+        changed = ", and the kit's code has changed since" if set(self.manifest.get("code", ())) - {code_checksum()} else ""
         return f"Trained already ({self.manifest['finished'][:16]} UTC{changed}); to train it again, delete {self.folder}"
 
     def write_metrics(self, rows: list[dict[str, Any]]) -> None:

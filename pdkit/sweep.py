@@ -11,7 +11,7 @@ from .cli import Parser
 from .errors import PdkitError
 from .files import ROOT, locked, runs_root
 from .main_job import duration
-from .sweep_jobs import bases_to_make, finished, make_jobs, missing, outdated, unlike_recorded
+from .sweep_jobs import OF_BASE, bases_to_make, finished, make_jobs, missing, outdated, unlike_recorded
 from .sweep_progress import Progress
 from .sweep_ray import Ray, must_be_installed
 from .sweep_run import LOG, Backend, Job, JobFunction, Local, run_job, run_jobs
@@ -34,12 +34,16 @@ def record_results(name: str, jobs: Sequence[Job], command: str) -> int:
     """Merge the finished jobs' rows and curves into data/results; returns how many."""
     import pandas as pd
 
-    from .recorded import SETTINGS, record
+    from .recorded import SETTINGS, mark, record
 
     results = [(job, result) for job in jobs if (result := finished(job))]
     if results:
-        rows = [result["row"] | job.labels | {"command": job.command, "sweep": command, SETTINGS: job.settings} for job, result in results]
-        record(name, pd.DataFrame(rows), pd.DataFrame([point | job.labels for job, result in results for point in result["curve"]]))
+        told = [{name: value for name, value in job.settings.items() if name in result["settings"] or name.startswith(OF_BASE)}
+                for job, result in results]  # without fields that the configuration did not have when it ran
+        rows = [result["row"] | job.labels | {"command": job.command, "sweep": command, SETTINGS: mark(settings)}
+                for (job, result), settings in zip(results, told, strict=True)]
+        curves = pd.DataFrame([point | job.labels for job, result in results for point in result["curve"]])
+        record(name, pd.DataFrame(rows), curves, {mark(settings): settings for settings in told})
     return len(results)
 
 

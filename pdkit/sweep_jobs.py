@@ -17,11 +17,10 @@ from .imitate import ImitateConfig, configured, untrained
 from .main_job import evaluation_minutes, expected_minutes
 from .methods.registry import base_folder, method_config, trainer_of
 from .nb_cells import notebook_checksum, parameters_of
-from .online_config import OnlineConfig
 from .policies import Policy, load_policy
 from .policies.base import read_card
 from .profiles import flat
-from .recorded import SETTINGS, essence, load
+from .recorded import SETTINGS, essence, load, settings_of, unlike
 from .runs import NO_MATTER
 from .sweep_run import Job, base_settings
 from .sweep_spec import Spec
@@ -34,6 +33,7 @@ BASE_DEFAULTS = {"policy": "bet", "episodes": 200}  # of the training of a base 
 BASE_OPTIONS = ("task", "policy", "num_demos", "demos", "episodes")
 NUMBERS = ("episodes", "num_demos")  # of all these; the others are words
 RECIPE = re.compile(r"[\w.,=+-]+")
+OF_BASE = "base: "  # in a training's settings, before what makes its base policy
 UNTIED = {*NO_MATTER, "threads", "pictures", "strict"}  # what a row's settings do not tell, as its numbers do not depend on it
 
 
@@ -86,7 +86,8 @@ def _training(spec: Spec, cell: dict[str, Any], seed: int) -> Job:
             given |= {"demos": demos.checksum, "num_demos": demos.num}
     words = ["train", "decorated", *_options(OPTIONS, cell), "--seeds", str(seed), *_set(settings)]
     return _job(spec, cell | {"seed": seed}, {"task": cell["task"], "recipe": cell["recipe"], "seed": seed}, words, like=cell["method"],
-                config=flat(config) | given, usual=flat(OnlineConfig()) | (given if cell.get("base") in spec.bases else {}),
+                config=flat(config) | given,
+                settings=flat(config) | (_own_base(spec, cell) if cell.get("base") in spec.bases else given),
                 minutes=spec.minutes or expected_minutes(config, cell["episodes"]))
 
 
@@ -169,7 +170,7 @@ def _imitation(spec: Spec, cell: dict[str, Any], seed: int) -> Job:
     demos = demos.first(cell.get("num_demos", demos.num))
     words = ["train", "base", *_options(BASE_OPTIONS, cell), *_set(settings)]
     return _job(spec, cell | {"seed": seed}, {"task": cell["task"], "recipe": cell["recipe"], "seed": seed}, words,
-                like=f"{cell['task']} {cell['policy']}", minutes=spec.minutes, usual=asdict(ImitateConfig()) | policy.defaults,
+                like=f"{cell['task']} {cell['policy']}", minutes=spec.minutes,
                 config={"policy": policy.kind, "demos_checksum": demos.checksum} | asdict(config)
                 | {name: value for name, value in policy.config.items() if name not in policy.made})
 
@@ -209,17 +210,20 @@ def _notebook(spec: Spec, cell: dict[str, Any], seed: int) -> Job:
                 | {p.name: p.default for p in known.values() if p.name not in ("out", *UNTIED)} | values)
 
 
+def _own_base(spec: Spec, cell: dict[str, Any]) -> dict[str, Any]:
+    """What makes the base policy that a spec names: a training's settings hold that, as its weights are others on each machine."""
+    made = {"recipe": "base"} | spec.bases[cell["base"]]
+    return {f"{OF_BASE}{name}": value for name, value in _imitation(spec, made, made.get("seed", 0)).config.items()}
+
+
 def _job(spec: Spec, parameters: dict[str, Any], labels: dict[str, Any], words: list[str], config: dict[str, Any],
-         usual: dict[str, Any] | None = None, **others: Any) -> Job:
-    """`usual` holds the values of `config` that a row's settings leave out: those of a new field that changes nothing by itself, and the
-    weights of a base policy that each machine makes for itself."""
+         settings: dict[str, Any] | None = None, **others: Any) -> Job:
     objects = object_set(TASKS[labels["task"]]) if labels["task"] in TASKS else ""
     marks = parameters | ({"objects": objects} if objects else {})  # what was run on other objects is another job
-    told = {k: v for k, v in config.items() if k not in (*UNTIED, "seed") and (usual is None or k not in usual or usual[k] != v)}
-    settings = hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()[:12]
+    told = {name: value for name, value in (settings or config).items() if name not in (*UNTIED, "seed")}
     key = hashlib.sha256(json.dumps(marks, sort_keys=True).encode()).hexdigest()[:10]
     folder = runs_root() / "sweeps" / spec.name / f"{labels['task']}-{labels['recipe']}-seed{labels['seed']}-{key}"
-    return Job(spec.kind, labels, tuple(words), folder, parameters, config, settings=f"s{settings}", **others)
+    return Job(spec.kind, labels, tuple(words), folder, parameters, config, json.loads(json.dumps(told)), **others)
 
 
 def finished(job: Job) -> dict[str, Any] | None:
@@ -251,11 +255,12 @@ def missing(jobs: Sequence[Job], name: str) -> list[Job]:
         rows = load(name)[0]
     except PdkitError:  # nothing is recorded yet
         return list(jobs)
-    settings = rows[SETTINGS].fillna("") if SETTINGS in rows else [""] * len(rows)
-    done = dict(zip(zip(rows.task, rows.recipe, rows.seed, map(essence, rows.command), strict=True), settings, strict=True))
+    marks = rows[SETTINGS].fillna("") if SETTINGS in rows else [""] * len(rows)
+    done = dict(zip(zip(rows.task, rows.recipe, rows.seed, map(essence, rows.command), strict=True), marks, strict=True))
+    known = settings_of(name)
 
     def there(job: Job) -> bool:
         key = (*(job.labels[name] for name in ("task", "recipe", "seed")), essence(job.command))
-        return key in done and done[key] in ("", job.settings)
+        return key in done and not unlike(known.get(done[key], {}), job.settings)
 
     return [job for job in jobs if not there(job)]

@@ -47,7 +47,7 @@ class Job:
     folder: Path  # its name holds a hash of the parameters
     parameters: dict[str, Any]
     config: dict[str, Any] = field(default_factory=dict)  # everything that these parameters amount to today (of a notebook: its code, too)
-    settings: str = ""  # the beginning of a checksum of that, without the seed and what does not matter: s and 12 digits
+    settings: dict[str, Any] = field(default_factory=dict)  # what of it a recorded row tells: all but the seed and what does not matter
     like: str = ""  # jobs that are alike take alike long: a method, a notebook
     minutes: float | None = None  # expected
     out: str = ""  # where the command writes; empty: to `run` in the folder

@@ -7,7 +7,9 @@ import json
 import math
 import shlex
 import sys
+from collections.abc import Callable
 from dataclasses import asdict, fields
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -270,12 +272,13 @@ def _base_episodes(base: Policy, spec: TaskSpec, episodes: int, config: OnlineCo
                    ) -> pd.DataFrame:
     """The base policy's test episodes: the same for every method that starts from it, and for every seed unless it samples, so they are run
     once and kept, where the kit's own code decides them: that of a task or policy from elsewhere is not seen to change."""
-    make = getattr(spec.make, "func", spec.make)
-    if not all(one.__module__.startswith("pdkit.") for one in (make, type(base))):
+    code, arguments = _behind(spec.make)
+    if not all(one.__module__.startswith("pdkit.") for one in (*code, type(base))):
         return _episodes(base, spec, episodes, config.seed)
     draw = [config.seed] if base.samples else []
     weights = [started_from[name] for name in ("base", "encoder", "objects") if name in started_from]
-    of_task = {field.name: getattr(spec, field.name) for field in fields(spec)} | {"make": f"{make.__module__}.{make.__qualname__}"}
+    of_task = {field.name: getattr(spec, field.name) for field in fields(spec)} | {
+        "make": [*(f"{one.__module__}.{one.__qualname__}" for one in code), *arguments]}
     what = json.dumps([of_task, config.start_fraction, episodes, *weights, base.kind, base.config, describe_machine()["versions"],
                        code_checksum(), *draw])
     kept = runs_root() / "base_episodes" / f"{spec.name}-{hashlib.sha256(what.encode()).hexdigest()[:16]}.csv"
@@ -284,6 +287,18 @@ def _base_episodes(base: Policy, spec: TaskSpec, episodes: int, config: OnlineCo
         with atomic_file(kept) as temporary:
             table.to_csv(temporary, index=False)
     return pd.read_csv(kept)
+
+
+def _behind(make: Any) -> tuple[list[Callable], list[str]]:
+    """The classes and functions that make a simulator, those among a partial's arguments, too; and the words and numbers among these."""
+    if isinstance(make, TaskSpec):
+        return _behind(make.make)
+    if isinstance(make, partial):
+        parts = [_behind(part) for part in (make.func, *make.args, *make.keywords.values())]
+        return [one for code, _ in parts for one in code], [text for _, texts in parts for text in texts]
+    if callable(make) and hasattr(make, "__qualname__"):
+        return [make], []
+    return ([], [repr(make)]) if type(make).__module__ == "builtins" else ([type(make)], [])
 
 
 def _outcome(name: str, table: pd.DataFrame) -> dict[str, float | None]:

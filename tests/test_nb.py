@@ -118,10 +118,10 @@ def test_a_failing_cell_is_one_sentence_and_leaves_no_old_result(folder, tmp_pat
 
 
 def test_what_fails_after_its_result_has_none_and_does_not_command_the_terminal(folder, tmp_path):
-    write(folder / "01_first.ipynb", FINISH, "raise ValueError('\\x1b[2Jboom\\x07')", parameters=SIMPLE)
+    write(folder / "01_first.ipynb", FINISH, "raise type('\\x1b[3JValueError', (Exception,), {})('\\x1b[2Jboom\\x07')", parameters=SIMPLE)
     with pytest.raises(PdkitError) as error:
         nb.run_notebook("01_first", {}, tmp_path, progress=False)
-    assert not (tmp_path / "result.json").exists() and "(ValueError: [2Jboom)" in str(error.value)
+    assert not (tmp_path / "result.json").exists() and "([3JValueError: [2Jboom)" in str(error.value)
 
 
 def test_a_notebook_without_result_is_an_error(folder, tmp_path):

@@ -456,24 +456,42 @@ def test_missing_leaves_out_what_is_recorded_by_the_same_command_alone(tmp_path,
 
 
 def test_rows_whose_settings_have_changed_since_are_missing(tmp_path, results):
-    book = BOOK | {"grid": None, "cells": [{"recipe": "a"}], "seeds": [0]}
-    for spec in (written(tmp_path, **book), written(tmp_path, grid={"alpha": [0.1]})):
-        job, = sweep_jobs.make_jobs(load_spec(spec))[:1]
-        row = job.labels | {"command": job.command}
-        for settings, gone in ((job.settings, []), ("s123456789ab", [job]), (None, [])):
-            recorded.record("marked", pd.DataFrame([row | {recorded.SETTINGS: settings}]), pd.DataFrame())
+    """By the fields that both have: one that is newer than the row makes it no older."""
+    for values, name in ((BOOK | {"grid": None, "cells": [{"recipe": "a"}], "seeds": [0]}, "alpha"), ({"grid": {"alpha": [0.1]}}, "utd")):
+        job = sweep_jobs.make_jobs(load_spec(written(tmp_path, **values)))[0]
+        without = {key: value for key, value in job.settings.items() if key != name}
+        for settings, gone in ((job.settings, []), (without, []), (without | {name: 0.77}, [job]), (None, [])):
+            mark = settings and recorded.mark(settings)
+            row = pd.DataFrame([job.labels | {"command": job.command, recorded.SETTINGS: mark}])
+            recorded.record("marked", row, pd.DataFrame(), settings and {mark: settings})
             assert sweep_jobs.missing([job], "marked") == gone
-        assert job.settings[0] == "s" and len(job.settings) == 13  # never a number to pandas
+            assert recorded.settings_of("marked") == ({mark: settings} if settings else {})
+        assert recorded.mark(without)[0] == "s" and len(recorded.mark(without)) == 13  # never a number to pandas
+
+
+def test_a_base_policy_that_the_sweep_makes_is_told_by_what_makes_it(tmp_path):
+    """Its weights are others on each machine, made or not."""
+    def settings(**base):
+        spec = written(tmp_path, fixed=dict(task="StackCube", profile="smoke", episodes=2, base="runs/none/own"), grid={}, seeds=[0],
+                       bases={"runs/none/own": {"task": "StackCube", "policy": "mlp"} | base})
+        return sweep_jobs.make_jobs(load_spec(spec))[0].settings
+
+    usual = settings()
+    assert usual["base: policy"] == "mlp" and "base" not in usual and "base: demos_checksum" in usual
+    assert recorded.unlike(usual, settings(iterations=77)) == ["base: iterations"]
+    assert "base: demos_checksum" in recorded.unlike(usual, settings(num_demos=5))
 
 
 def test_settings_are_those_of_the_profile_and_of_the_notebooks_defaults(tmp_path, monkeypatch):
     """Both decide what a job computes, and neither is among the spec's values."""
     path = written(tmp_path, seeds=[0, 1])
-    before = [job.settings for job in sweep_jobs.make_jobs(load_spec(path))]
+    def marks():
+        return [recorded.mark(job.settings) for job in sweep_jobs.make_jobs(load_spec(path))]
+
+    before = marks()
     assert len(set(before)) == 2 and before[:2] == before[2:]  # a recipe's, whatever the seed
     monkeypatch.setitem(profiles._SMOKE, "utd", 0.5)
-    after = [job.settings for job in sweep_jobs.make_jobs(load_spec(path))]
-    assert not set(before) & set(after)
+    assert not set(before) & set(marks())
 
     book = tmp_path / "own.ipynb"
     cell = 'profile = "smoke"\nout = ""\nlr = {}\nseed = 0\nthreads = {}'
@@ -483,7 +501,7 @@ def test_settings_are_those_of_the_profile_and_of_the_notebooks_defaults(tmp_pat
         source = nbformat.v4.new_code_cell(cell.format(lr, threads), metadata={"tags": ["parameters"]})
         nbformat.write(nbformat.v4.new_notebook(cells=[source]), book)
         job, = sweep_jobs.make_jobs(spec)
-        return job, job.settings
+        return job, recorded.mark(job.settings)
 
     job, mark = settings(0.1)
     write_json(job.result, {"settings": job.config, "seconds": 1.0})
@@ -509,11 +527,14 @@ def test_rows_of_one_recipe_that_were_made_otherwise_are_told(results, capsys):
     command = "pdkit train decorated Door --method rot --profile lesson --recipe {} --episodes 60 --seeds {} --set total_steps={}"
     rows = pd.DataFrame([{"task": "Door", "recipe": recipe, "seed": seed, "command": command.format(recipe, seed, steps), "settings": mark}
                          for recipe, seed, steps, mark in (("a", 0, 40_000, None), ("a", 1, 80_000, None), ("b", 0, 40_000, "s1"),
-                                                           ("b", 1, 40_000, "s2"), ("c", 0, 40_000, "s1"), ("c", 1, 40_000, None))])
-    recorded.record("mix", rows, pd.DataFrame())
+                                                           ("b", 1, 40_000, "s2"), ("c", 0, 40_000, "s1"), ("c", 1, 40_000, None),
+                                                           ("c", 2, 40_000, "s3"))])
+    settings = {"s1": {"utd": 0.1, "alpha": 1}, "s2": {"utd": 0.2}, "s3": {"alpha": 1, "newer": 0}}
+    recorded.record("mix", rows, pd.DataFrame(), settings)
     said = capsys.readouterr().out
     assert [f"of Door {recipe} were run with different settings" in said for recipe in "abc"] == [True, True, False]
-    assert recorded.mixed("mix", rows) == [line for line in report.table_problems("mix", rows, results) if "different" in line] != []
+    problems = report.table_problems("mix", rows, results)
+    assert recorded.mixed("mix", rows, settings) == [line for line in problems if "different" in line] != []
 
 
 @pytest.mark.parametrize("other, same", [

@@ -4,6 +4,7 @@ from __future__ import annotations
 import atexit
 import multiprocessing
 import signal
+import sys
 from collections.abc import Callable
 from multiprocessing import shared_memory
 
@@ -167,11 +168,12 @@ class InProcess:
 
 
 def must_be_importable(*code: Callable) -> None:
-    """Raises PdkitError for a simulator or policy class that other processes cannot have: it is defined in a notebook or script."""
+    """Raises PdkitError for a simulator or policy class that other processes cannot have: it is defined in a notebook. (A script's they
+    import again.)"""
     for one in (getattr(each, "func", each) for each in code):
-        if getattr(one, "__module__", "") == "__main__":
-            raise PdkitError(f"{one.__qualname__} is defined in a notebook or script, from where other processes cannot import it: move it "
-                             "into a module of its own, or set env_workers=0 and eval_workers=0.")
+        if getattr(one, "__module__", "") == "__main__" and not hasattr(sys.modules["__main__"], "__file__"):
+            raise PdkitError(f"{one.__qualname__} is defined in a notebook, from where other processes cannot import it: move it into a "
+                             "module of its own, or set env_workers=0 and eval_workers=0.")
 
 
 class Workers:

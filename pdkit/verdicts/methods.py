@@ -238,8 +238,9 @@ def _() -> Finding:
 def _() -> Finding:
     """By the mean success over all evaluations of runs with the same base policy, steps and seeds. (A rule of after the runs.)"""
     _, curves = recorded("leaderboard")
-    sides = [efficiency(curves, recipe) for recipe in (DECORATOR, "ppo_decorator")]
-    return set_against("leaderboard", *sides, ("mean success over the evaluations: by SAC", "by PPO"))
+    recipes = (DECORATOR, "ppo_decorator")
+    return set_against("leaderboard", *(efficiency(curves, recipe) for recipe in recipes),
+                       ("mean success over the evaluations: by SAC", "by PPO"), recipes=recipes)
 
 
 @measures("Policy Decorator with PPO considerably outperforms residual RL")
