@@ -1,6 +1,7 @@
 """Notebooks: what a lesson calls (`folder`, `Line`, `finish`), and running one without a browser (`pdkit nb`)."""
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import os
@@ -146,7 +147,8 @@ def run_notebook(name: str, parameters: dict[str, Any] | None, out: str | Path, 
     from .nb_run import execute
 
     out = Path(out).resolve()
-    (out / RESULT).unlink(missing_ok=True)
+    with contextlib.suppress(OSError):  # `folder` tells what is wrong with it
+        (out / RESULT).unlink()
     path, values = find_notebook(name), checked_parameters(name, parameters or {})
     write_json(folder(out) / "parameters.json", values)  # finds out now whether the folder can be written
     try:

@@ -38,7 +38,7 @@ def record_results(name: str, jobs: Sequence[Job], command: str) -> int:
 
     results = [(job, result) for job in jobs if (result := finished(job))]
     if results:
-        told = [{name: value for name, value in job.settings.items() if name in result["settings"] or name.startswith(OF_BASE)}
+        told = [{name: value for name, value in job.settings.items() if name in result.get("settings", {}) or name.startswith(OF_BASE)}
                 for job, result in results]  # without fields that the configuration did not have when it ran
         rows = [result["row"] | job.labels | {"command": job.command, "sweep": command, SETTINGS: mark(settings)}
                 for (job, result), settings in zip(results, told, strict=True)]
