@@ -111,7 +111,7 @@ def _() -> Finding:
     rival = best(table, BESIDES)
     one, two = (by_seed(table, recipe, "decorated_success") for recipe in (DECORATOR, rival))
     found = set_against(records, one, two, (DECORATOR, rival), paper=("Square", "Transport"))
-    return replace(found, measured=found.measured + cells + besides(table, [recipe for recipe in BESIDES if recipe != rival]))
+    return replace(found, measured=found.measured + cells + _others(table, rival))
 
 
 @measures("DPPO successfully fine-tunes")
@@ -121,4 +121,9 @@ def _() -> Finding:
     rival = best(table, BESIDES)
     end, start = (by_seed(table, rival, column) for column in ("decorated_success", "base_success"))
     found = set_against(records, end, start, (rival, "its start"), paper=("Square", "Transport"))
-    return replace(found, measured=found.measured + besides(table, [recipe for recipe in BESIDES if recipe != rival]))
+    return replace(found, measured=found.measured + _others(table, rival))
+
+
+def _others(table: pd.DataFrame, rival: str) -> str:
+    """What is told of DPPO's settings but the one that is judged."""
+    return besides(table, [recipe for recipe in BESIDES if recipe != rival])

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 
+from ..calql_analysis import SETUPS
 from ..claims import (
     EXPLODES,
     METHOD,
@@ -132,8 +133,7 @@ def _() -> Finding:
 def _() -> Finding:
     """The original's setting ends above that of the baseline, A above E, on Adroit. (A rule of after the runs.)"""
     both = _setups()
-    setups = dict(zip("ABCDE", ("calql_a", "calql_b", "calql_c", "calql_d", "calql"), strict=True))
-    ends = {letter: by_seed(both, recipe, "decorated_success") for letter, recipe in setups.items()}
+    ends = {letter: by_seed(both, recipe, "decorated_success") for letter, recipe in SETUPS.items()}
     found = set_against("calql", ends["A"], ends["E"], ("A", "E"), paper=[task for task in ADROIT if task in set(both.task)])
     way = ", ".join(f"{letter} {percent(average(named_by(ADROIT, values)[0]))}" for letter, values in ends.items())
     return replace(found, measured=f"{found.measured}; {way}", command=_with_door(found))
