@@ -275,14 +275,21 @@ def compared(record: str, first: str, second: str = "", *, column: str = "decora
 def set_against(record: str | Sequence[str], one: pd.Series, two: pd.Series, names: tuple[str, str], *, sign: int = 1, enough: float = 0.0,
                 paper: Sequence[str] = (), recipes: Collection[str] = ()) -> Finding:
     """The same for runs by (task, seed), from wherever; `names` says what both are called, `recipes` which of the record were looked at."""
+    interval, values, (first, second), told = set_apart(one, two, paper)
+    told = f"{names[0]} {percent(first)}, {names[1]} {percent(second)}: {signed(interval.value)} points{told}"
+    return finding(record, values, told, points(interval), judged_over_tasks(sign * values, enough), paper, recipes=recipes)
+
+
+def set_apart(one: pd.Series, two: pd.Series, paper: Sequence[str] = ()) -> tuple[Interval, pd.Series, tuple[float, float], str]:
+    """The differences of runs by (task, seed) on the tasks that are judged and their interval, what both are on average, and in words the
+    differences on each task, those included that are not judged."""
     one, two = matched(one, two)
     chosen, others = named_by(paper, _of_enough_seeds(one))
     rest = (one - two).loc[others.index]
     (one, two), near_0 = told_apart(one.loc[chosen.index], two.loc[chosen.index])
     interval, values = difference(one, two)
-    told = (f"{names[0]} {percent(average(one))}, {names[1]} {percent(average(two))}: {signed(interval.value)} points"
-            f"{task_by_task(values, signed)}{not_judged(near_0, rest.groupby(level='task').mean().to_dict())}")
-    return finding(record, values, told, points(interval), judged_over_tasks(sign * values, enough), paper, recipes=recipes)
+    told = f"{task_by_task(values, signed)}{not_judged(near_0, rest.groupby(level='task').mean().to_dict())}"
+    return interval, values, (average(one), average(two)), told
 
 
 def ahead(record: str | Sequence[str], table: pd.DataFrame, own: str, kinds: Mapping[str, Sequence[str]], paper: Sequence[str],

@@ -26,7 +26,6 @@ from ..claims import (
     jointly,
     judged,
     judged_over_tasks,
-    matched,
     mean_interval,
     named_by,
     not_judged,
@@ -35,6 +34,7 @@ from ..claims import (
     points,
     recorded,
     set_against,
+    set_apart,
     signed,
     task_by_task,
     times,
@@ -71,13 +71,8 @@ def _() -> Finding:
 def _efficiency(first: str, second: str) -> tuple[Interval, pd.Series, str]:
     """Difference of the mean success over all evaluations of the online stage, on Adroit where it was run; and in words."""
     _, curves = recorded("calql")
-    one, two = matched(efficiency(curves, first), efficiency(curves, second))
-    chosen, others = named_by(ADROIT, one)
-    rest = (one - two).loc[others.index].groupby(level="task").mean()
-    (one, two), near_0 = told_apart(one.loc[chosen.index], two.loc[chosen.index])
-    interval, values = difference(one, two)
-    return interval, values, (f"mean success over the online evaluations {percent(average(one))} and {percent(average(two))}"
-                              f"{task_by_task(values, signed)}{not_judged(near_0, rest.to_dict())}")
+    interval, values, means, told = set_apart(efficiency(curves, first), efficiency(curves, second), ADROIT)
+    return interval, values, "mean success over the online evaluations {} and {}".format(*map(percent, means)) + told
 
 
 @measures("Cal-QL depends strongly on negative trajectories")
