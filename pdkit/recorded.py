@@ -28,6 +28,7 @@ from .tasks.partnet import object_set
 KEYS = ["task", "recipe", "seed"]  # a row with the same ones is replaced
 TRAINING = "pdkit train decorated"  # how a command that makes a row of a training begins
 SETTINGS = "settings"  # the column that tells rows of other settings apart: a `mark`, whose settings the manifest holds
+UNTIED = {*NO_MATTER, "threads", "pictures", "strict"}  # what a row's settings do not tell, as its numbers do not depend on it
 OTHER_BASE = re.compile(r",base=[^,]*")  # in the recipe of a method that starts from another policy than its own
 OWN = ",partnet"  # behind the recipe of a row on the user's own objects
 
@@ -73,6 +74,11 @@ def picture_of(name: str, task: str, table: pd.DataFrame) -> str:
     """What the picture of a task is called: NAME of Door, or of the first task where Door is none of them, NAME-TASK of the others."""
     first = "Door" if "Door" in set(table.task) else table.task.iloc[0]
     return name if task == first else f"{name}-{task}"
+
+
+def told_of(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Of a run's settings those that its row tells: all but the seed and what does not matter, as JSON gives them back."""
+    return json.loads(json.dumps({name: value for name, value in settings.items() if name not in (*UNTIED, "seed")}))
 
 
 def mark(settings: Mapping[str, Any]) -> str:

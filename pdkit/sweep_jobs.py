@@ -20,7 +20,7 @@ from .nb_cells import notebook_checksum, parameters_of
 from .policies import Policy, load_policy
 from .policies.base import read_card
 from .profiles import flat
-from .recorded import SETTINGS, essence, load, settings_of, unlike
+from .recorded import SETTINGS, UNTIED, essence, load, settings_of, told_of, unlike
 from .runs import NO_MATTER
 from .sweep_run import Job, base_settings
 from .sweep_spec import Spec
@@ -34,7 +34,6 @@ BASE_OPTIONS = ("task", "policy", "num_demos", "demos", "episodes")
 NUMBERS = ("episodes", "num_demos")  # of all these; the others are words
 RECIPE = re.compile(r"[\w.,=+-]+")
 OF_BASE = "base: "  # in a training's settings, before what makes its base policy
-UNTIED = {*NO_MATTER, "threads", "pictures", "strict"}  # what a row's settings do not tell, as its numbers do not depend on it
 
 
 def make_jobs(spec: Spec) -> list[Job]:
@@ -220,10 +219,9 @@ def _job(spec: Spec, parameters: dict[str, Any], labels: dict[str, Any], words: 
          settings: dict[str, Any] | None = None, **others: Any) -> Job:
     objects = object_set(TASKS[labels["task"]]) if labels["task"] in TASKS else ""
     marks = parameters | ({"objects": objects} if objects else {})  # what was run on other objects is another job
-    told = {name: value for name, value in (settings or config).items() if name not in (*UNTIED, "seed")}
     key = hashlib.sha256(json.dumps(marks, sort_keys=True).encode()).hexdigest()[:10]
     folder = runs_root() / "sweeps" / spec.name / f"{labels['task']}-{labels['recipe']}-seed{labels['seed']}-{key}"
-    return Job(spec.kind, labels, tuple(words), folder, parameters, config, json.loads(json.dumps(told)), **others)
+    return Job(spec.kind, labels, tuple(words), folder, parameters, config, told_of(settings or config), **others)
 
 
 def finished(job: Job) -> dict[str, Any] | None:

@@ -37,7 +37,7 @@ from .pixels.task import ENCODER, encoder_of, pixel_spec, save_visual
 from .policies import POLICIES, Policy, load_policy, save_policy
 from .policies.base import read_card
 from .profiles import PROFILES, differences, flat
-from .recorded import record
+from .recorded import SETTINGS, mark, record, told_of
 from .runs import Run, commits, describe_machine, kept_so_far, origin
 from .seeds import reported_seeds
 from .sweep_spec import check_names
@@ -186,11 +186,12 @@ def _decorated(args) -> int:
         except KeyboardInterrupt:
             print(f"\nInterrupted. {kept_so_far(out)} the same command.", file=sys.stderr)
             return 130
-        row |= {"recipe": args.recipe, "command": command_of(args, seed), "commit": commits(read_json(out / "manifest.json"))}
+        row |= {"recipe": args.recipe, "command": command_of(args, seed), "commit": commits(manifest := read_json(out / "manifest.json"))}
         print(", ".join(f"{k} {v}" for k, v in row.items()), flush=True)
         if args.record:
             curves = pd.read_csv(out / "metrics.csv").assign(task=args.task, seed=seed, recipe=args.recipe)
-            record(args.record, pd.DataFrame([row]), curves)
+            told = told_of(manifest["parameters"])
+            record(args.record, pd.DataFrame([row | {SETTINGS: mark(told)}]), curves, {mark(told): told})
     return 0
 
 

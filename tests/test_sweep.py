@@ -379,8 +379,14 @@ def test_a_real_grid_of_two_trainings_is_recorded_and_skipped_the_second_time(tm
     assert cli.main(["sweep", str(path), "--dry-run"]) == 0 and capsys.readouterr().out.count("finished") == 2
     assert cli.main(["sweep", str(path), "--record", "tiny"]) == 0
     assert "2 jobs, 2 finished, 0 to do" in capsys.readouterr().out and len(pd.read_csv(results / "tiny.csv")) == 2
+    # The command of a row, by hand, records the same row, and tells as well what it was run with.
+    one, other = sweep_jobs.make_jobs(load_spec(path))
+    assert cli.main([*other.words, "--out", str(other.folder / "run"), "--record", "by_hand"]) == 0
+    mine, theirs = pd.read_csv(results / "by_hand.csv").iloc[0], table.iloc[1]
+    assert mine.decorated_success == theirs.decorated_success and mine.updates == theirs.updates
+    told = recorded.settings_of("by_hand", results)[mine.settings]
+    assert manifest["settings"][theirs.settings].items() <= told.items() and told["alpha"] == 0.3 and "seed" not in told
     # What ran with another recipe than the profile's of today is not passed off as the same.
-    one = sweep_jobs.make_jobs(load_spec(path))[0]
     result = read_json(one.result)
     write_json(one.result, result | {"settings": result["settings"] | {"gamma": 0.5, "eval_workers": 9}})
     assert cli.main(["sweep", str(path)]) == 2
