@@ -7,9 +7,7 @@ import json
 import math
 import shlex
 import sys
-from collections.abc import Callable
 from dataclasses import asdict, fields
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -43,7 +41,7 @@ from .seeds import reported_seeds
 from .sweep_spec import check_names
 from .tasks import get_task
 from .tasks.partnet import object_set
-from .tasks.spec import TaskSpec
+from .tasks.spec import TaskSpec, behind
 from .tensorboard import Board
 from .torch_setup import pick_device, set_threads
 
@@ -273,7 +271,7 @@ def _base_episodes(base: Policy, spec: TaskSpec, episodes: int, config: OnlineCo
                    ) -> pd.DataFrame:
     """The base policy's test episodes: the same for every method that starts from it, and for every seed unless it samples, so they are run
     once and kept, where the kit's own code decides them: that of a task or policy from elsewhere is not seen to change."""
-    code, arguments = _behind(spec.make)
+    code, arguments = behind(spec.make)
     if not all(one.__module__.startswith("pdkit.") for one in (*code, type(base))):
         return _episodes(base, spec, episodes, config.seed)
     draw = [config.seed] if base.samples else []
@@ -288,18 +286,6 @@ def _base_episodes(base: Policy, spec: TaskSpec, episodes: int, config: OnlineCo
         with atomic_file(kept) as temporary:
             table.to_csv(temporary, index=False)
     return pd.read_csv(kept)
-
-
-def _behind(make: Any) -> tuple[list[Callable], list[str]]:
-    """The classes and functions that make a simulator, those among a partial's arguments, too; and the words and numbers among these."""
-    if isinstance(make, TaskSpec):
-        return _behind(make.make)
-    if isinstance(make, partial):
-        parts = [_behind(part) for part in (make.func, *make.args, *make.keywords.values())]
-        return [one for code, _ in parts for one in code], [text for _, texts in parts for text in texts]
-    if callable(make) and hasattr(make, "__qualname__"):
-        return [make], []
-    return ([], [repr(make)]) if type(make).__module__ == "builtins" else ([type(make)], [])
 
 
 def _outcome(name: str, table: pd.DataFrame) -> dict[str, float | None]:

@@ -11,7 +11,7 @@ from multiprocessing import shared_memory
 import numpy as np
 
 from ..errors import PdkitError
-from .spec import Sim, TaskSpec
+from .spec import Sim, TaskSpec, behind
 
 IDLE = -1  # instead of a seed: this lane has nothing more to do
 DIED = "A simulator process died; run `pdkit doctor`, or set env_workers=0 to see its error."
@@ -170,7 +170,7 @@ class InProcess:
 def must_be_importable(*code: Callable) -> None:
     """Raises PdkitError for a simulator or policy class that other processes cannot have: it is defined in a notebook. (A script's they
     import again.)"""
-    for one in (getattr(each, "func", each) for each in code):
+    for one in (one for each in code for one in behind(each)[0]):
         if getattr(one, "__module__", "") == "__main__" and not hasattr(sys.modules["__main__"], "__file__"):
             raise PdkitError(f"{one.__qualname__} is defined in a notebook, from where other processes cannot import it: move it into a "
                              "module of its own, or set env_workers=0 and eval_workers=0.")

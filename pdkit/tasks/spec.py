@@ -3,7 +3,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from functools import partial
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -58,3 +59,15 @@ class TaskSpec:
         rest = np.zeros_like(action)
         rest[list(self.held_actions)] = action[list(self.held_actions)]
         return rest
+
+
+def behind(make: Any) -> tuple[list[Callable], list[str]]:
+    """The classes and functions that make a simulator, those among a partial's arguments, too; and the words and numbers among these."""
+    if isinstance(make, TaskSpec):
+        return behind(make.make)
+    if isinstance(make, partial):
+        parts = [behind(part) for part in (make.func, *make.args, *make.keywords.values())]
+        return [one for code, _ in parts for one in code], [text for _, texts in parts for text in texts]
+    if callable(make) and hasattr(make, "__qualname__"):
+        return [make], []
+    return ([], [repr(make)]) if type(make).__module__ == "builtins" else ([type(make)], [])
