@@ -55,16 +55,16 @@ def finish(result: dict[str, Any], out: str | Path = "") -> None:
 class Line:
     """One line of progress, updated in place at most every `every` seconds.
 
-    In a notebook a display that is replaced, so that an executed notebook holds one output; on a terminal the same
-    line again; elsewhere (a log file) a new line, at most every 30 s.
+    In a notebook a display of the running cell that is replaced until it is closed, so that an executed notebook holds one output for
+    each last word, in the cell that said it; on a terminal the same line again; elsewhere (a log file) a new line, at most every 30 s.
     """
 
     def __init__(self, every: float = 2.0):
-        shell = sys.modules.get("IPython") and sys.modules["IPython"].get_ipython()
-        self._kernel = hasattr(shell, "kernel")
+        self._shell = sys.modules.get("IPython") and sys.modules["IPython"].get_ipython()
+        self._kernel = hasattr(self._shell, "kernel")
         self._terminal = not self._kernel and sys.stdout.isatty()
         self._every = every if self._kernel or self._terminal else max(every, 30.0)
-        self._handle = None
+        self._handle, self._cell = None, 0
         self._last = -float("inf")
 
     def update(self, text: str) -> None:
@@ -75,6 +75,7 @@ class Line:
     def close(self, text: str) -> None:
         """Show `text` in any case, as the last word."""
         self._show(text)
+        self._handle = None
         if self._terminal:
             print()
 
@@ -93,8 +94,8 @@ class Line:
     def _display(self, data: dict[str, str]) -> None:
         from IPython.display import display
 
-        if self._handle is None:
-            self._handle = display(data, raw=True, display_id=True)
+        if self._handle is None or self._cell != self._shell.execution_count:
+            self._handle, self._cell = display(data, raw=True, display_id=True), self._shell.execution_count
         else:
             self._handle.update(data, raw=True)
 

@@ -170,12 +170,15 @@ def test_interrupting_the_runner_ends_the_kernel(tmp_path):
 
 def test_the_notebooks_own_progress_line_reaches_the_terminal(folder, tmp_path, capsys, monkeypatch):
     slow = "import time\nfrom pdkit import nb\nline = nb.Line()\nline.update('step 7 of 9')\ntime.sleep(2.5)"
-    write(folder / "01_first.ipynb", slow, "line.close('all 9 steps')", FINISH, parameters=SIMPLE)
+    ends = "line.update('half')\nline.close('all 9 steps')\nline.close('and one more')"
+    write(folder / "01_first.ipynb", slow, ends, "line.close('none left')", FINISH, parameters=SIMPLE)
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True, raising=False)
     nb.run_notebook("01", {}, tmp_path)
     assert "step 7 of 9" in capsys.readouterr().out
-    outputs = nbformat.read(tmp_path / "01_first.ipynb", 4).cells[3].outputs
-    assert [output.data["text/plain"] for output in outputs] == ["all 9 steps"]  # one output, replaced in place
+    shown = [[output.data["text/plain"] for output in cell.outputs if "data" in output]
+             for cell in nbformat.read(tmp_path / "01_first.ipynb", 4).cells[3:6]]
+    # Replaced in place until the last word, which stays where it was said.
+    assert shown == [["step 7 of 9"], ["all 9 steps", "and one more"], ["none left"]]
 
 
 # ---- what the command line refuses before anything runs --------------------------------------------------------------
