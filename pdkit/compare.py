@@ -216,6 +216,18 @@ def smoothness(table: pd.DataFrame, labels: Mapping[str, str] | None = None) -> 
     return pd.DataFrame(rows)
 
 
+def starting_points(table: pd.DataFrame, labels: Mapping[str, str], x: str = "jerk", y: str = "success") -> list[tuple[str, float, float]]:
+    """The policies that the recipes of one task start from, those from scratch left out: name, mean base_X and base_Y. One from which a
+    single recipe starts is called by that."""
+    rows = table[~table.recipe.map(from_scratch)].dropna(subset=[f"base_{x}", f"base_{y}"])
+    points = []
+    for (kind, _), mine in rows.groupby(["policy", rows[f"base_{y}"].round(4)]):
+        whose = list(dict.fromkeys(mine.recipe))
+        name = f"that of {labels.get(whose[0], whose[0])}" if len(whose) == 1 else STARTS.get(kind, STARTS["base"])
+        points.append((name, mine[f"base_{x}"].mean(), mine[f"base_{y}"].mean()))
+    return points
+
+
 def budgets(table: pd.DataFrame, labels: Mapping[str, str]) -> pd.DataFrame:
     """What the comparison does *not* hold equal, as text, a row a method: where it starts, demonstrations, recorded gradient updates
     (mean over runs), transitions an update in the lesson profile, and minutes."""

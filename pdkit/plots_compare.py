@@ -61,7 +61,8 @@ def over_seeds(statistic: Callable[..., float], *arrays: np.ndarray, repetitions
 
 @styled
 def curves_figure(curves: pd.DataFrame, *, column: str = "success_once", labels: dict[str, str] | None = None, base: float | None = None,
-                  own: pd.DataFrame | None = None, title: str = "", ylabel: str = "", log: bool = False) -> Picture:
+                  own: pd.DataFrame | None = None, starts: Mapping[str, float] | None = None, title: str = "", ylabel: str = "",
+                  log: bool = False) -> Picture:
     """`column` against environment steps: a line a recipe, the mean over its seeds, in a band from the least to the largest seed.
 
     Args:
@@ -69,6 +70,7 @@ def curves_figure(curves: pd.DataFrame, *, column: str = "success_once", labels:
         labels: recipe -> name, in drawing order; None: all.
         base: the base policy's value, dashed.
         own: the reader's own rows (the same columns), dotted with open circles.
+        starts: recipe -> value at step 0, an open square before its curve.
         log: a logarithmic axis.
     """
     _columns(curves, "recipe", "seed", "step", column)
@@ -83,6 +85,8 @@ def curves_figure(curves: pd.DataFrame, *, column: str = "success_once", labels:
             step, values = by.step.mean(), by[column]
             ax.plot(step, values.mean(), "-o", ms=3.5, color=color[recipe], label=f"{label} ({rows.seed.nunique()})")
             ax.fill_between(step, values.min(), values.max(), color=color[recipe], alpha=0.13, lw=0)
+        if starts and recipe in starts:
+            ax.plot(0, starts[recipe], "s", ms=6, mfc="white", color=color[recipe], clip_on=False, zorder=4)
         if own is not None and len(mine := own[(own.recipe == recipe) & own[column].notna()]):
             ax.plot(mine.step, mine[column], ":o", ms=5, mfc="white", color=color[recipe], label=f"{label}, your run")
     if base is not None:
@@ -171,12 +175,13 @@ def panels_figure(curves: pd.DataFrame, panels: Mapping[str, Sequence[str]], *, 
     for ax, (family, members) in zip(axes.flat, panels.items(), strict=False):
         if reference and reference not in members:
             _band(ax, curves, reference, column, "#9a9a9a", names.get(reference, reference))
-        for recipe in [r for r in names if r in members]:
+        mine = [recipe for recipe in names if recipe in members]
+        for above, recipe in zip(reversed(range(len(mine))), mine, strict=True):
             _band(ax, curves, recipe, column, color[recipe], names[recipe])
-            if starts and recipe in starts:
-                ax.plot(0, starts[recipe], "s", ms=6, mfc="white", color=color[recipe], clip_on=False, zorder=4)
-            if own is not None and len(mine := own[(own.recipe == recipe) & own[column].notna()]):
-                ax.plot(mine.step, mine[column], ":o", ms=5, mfc="white", color=color[recipe], label=f"{names[recipe]}, your run")
+            if starts and recipe in starts:  # a square in the other where they coincide
+                ax.plot(0, starts[recipe], "s", ms=5 + 2 * above, mfc="white", color=color[recipe], clip_on=False, zorder=4)
+            if own is not None and len(yours := own[(own.recipe == recipe) & own[column].notna()]):
+                ax.plot(yours.step, yours[column], ":o", ms=5, mfc="white", color=color[recipe], label=f"{names[recipe]}, your run")
         if base is not None:
             ax.axhline(base, color=COLORS["base"], ls="--", lw=1.2)
         _values(ax, "y", column, "", False)
@@ -237,14 +242,15 @@ def matrix_figure(values: pd.DataFrame, *, title: str = "", xlabel: str = "", yl
 
 @styled
 def trade_figure(table: pd.DataFrame, *, x: str = "jerk", y: str = "success", labels: dict[str, str] | None = None,
-                 own: pd.DataFrame | None = None, title: str = "", xlabel: str = "") -> Picture:
+                 own: pd.DataFrame | None = None, starts: Sequence[tuple[str, float, float]] = (), title: str = "", xlabel: str = ""
+                 ) -> Picture:
     """Two columns of the final policies against each other, such as jerk and success: a faint dot a run, a large one the mean.
 
-    The columns are called decorated_X and decorated_Y; base_X and base_Y of the policies that the methods start from are crosses,
-    named by the column `policy`. x is logarithmic. `own` holds the reader's rows, drawn as open circles.
+    The columns are called decorated_X and decorated_Y; `starts` (name, x, y), the policies that the methods start from, are crosses.
+    x is logarithmic. `own` holds the reader's rows, drawn as open circles.
     """
-    wanted = [f"{who}_{what}" for who in ("base", "decorated") for what in (x, y)]
-    _columns(table, "recipe", "policy", *wanted)
+    wanted = [f"decorated_{what}" for what in (x, y)]
+    _columns(table, "recipe", *wanted)
     table = table.dropna(subset=wanted)
     if table.empty:
         raise PdkitError(f"No run of this table has both {x} and {y}.")
@@ -259,8 +265,7 @@ def trade_figure(table: pd.DataFrame, *, x: str = "jerk", y: str = "success", la
             ax.plot(rows[f"decorated_{x}"].mean(), rows[f"decorated_{y}"].mean(), "o", ms=10, color=color[recipe], label=label)
         if own is not None and len(mine := own[own.recipe == recipe].dropna(subset=wanted)):
             ax.plot(mine[f"decorated_{x}"], mine[f"decorated_{y}"], "o", ms=11, mfc="none", color="black", label=f"{label}, your run")
-    for name, rows in table.groupby("policy"):
-        place = rows[f"base_{x}"].mean(), rows[f"base_{y}"].mean()
+    for name, *place in starts:
         ax.plot(*place, "X", ms=10, color="black", mec="white", zorder=4)
         ax.annotate(f"start: {name}", place, (7, -11), textcoords="offset points", fontsize=8.5)
     ax.set_xscale("log")

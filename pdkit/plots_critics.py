@@ -135,21 +135,28 @@ def calibration_figure(rows: pd.DataFrame, returns: float) -> Picture:
 @styled
 def offline_figure(curves: pd.DataFrame, labels: Mapping[str, str], own: pd.DataFrame | None = None, title: str = "") -> Picture:
     """The offline stage of each setup (the rows of step 0): mean Q of the data, the conservative gap, and the share of the policy's
-    values that the max lifts, against updates; the mean over seeds. `own` (the same columns) is dotted."""
+    values that the max lifts, against updates; the mean over seeds, dashed where it lies on another's. `own` (the same columns) is dotted.
+    """
     _columns(curves, "recipe", "seed", "step", "updates", "q_mean", "conservative", "calibrated")
     panels = {"q_mean": "Mean Q of the data", "conservative": "Gap to other actions", "calibrated": "Lifted by the max"}
     figure, axes = blank(1, 3, (10.6, 3.5))
     color = colours(dict(labels))
     for ax, (column, name) in zip(axes[0], panels.items(), strict=True):
+        drawn: list[pd.Series] = []
         for recipe, label in labels.items():
             rows = curves[(curves.recipe == recipe) & (curves.step == 0)]
             if len(rows):
-                ax.plot(rows.groupby("updates")[column].mean(), "-", color=color[recipe], label=f"{label} ({rows.seed.nunique()})")
+                line = rows.groupby("updates")[column].mean()
+                same = any(line.equals(other) for other in drawn)  # setups with the same offline stage: neither is hidden
+                drawn.append(line)
+                ax.plot(line, "--" if same else "-", color=color[recipe], lw=1.4 if same else 2.2, label=f"{label} ({rows.seed.nunique()})")
             if own is not None and len(mine := own[(own.recipe == recipe) & (own.step == 0)]):
                 ax.plot(mine.updates, mine[column], ":o", ms=4, mfc="white", color=color[recipe], label=f"{label}, your run")
         ax.set(xlabel="offline updates", xlim=(0, None))
         thousands(ax, integer=True)
         ax.set_title(name)
+    axes[0, 0].set_ylabel("Q, a discounted return")
+    axes[0, 1].set_ylabel("difference of Q")
     _percent(axes[0, 2], "share of values")
     handles, names = axes[0, 0].get_legend_handles_labels()
     figure.legend(handles, names, loc="outside lower center", ncols=3, fontsize=8.5)

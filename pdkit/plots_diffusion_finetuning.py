@@ -73,7 +73,8 @@ def inner_figure(rows: pd.DataFrame) -> Picture:
 
 
 @styled
-def ascent_figure(axis: np.ndarray, value: np.ndarray, solved: np.ndarray, path: np.ndarray, clouds: Mapping[str, np.ndarray]) -> Picture:
+def ascent_figure(axis: np.ndarray, value: np.ndarray, solved: np.ndarray, path: np.ndarray, clouds: Mapping[str, np.ndarray],
+                  title: str = "") -> Picture:
     """Left: stored actions (open) on their way up the least critic's value (colour) to where they are put back (full). Right: what the
     policy draws, a colour a moment. The line encloses the actions that solve the task at once.
 
@@ -95,7 +96,7 @@ def ascent_figure(axis: np.ndarray, value: np.ndarray, solved: np.ndarray, path:
         left.plot(*one.T, color=COLORS["lost"], lw=1.1)
     left.plot(*path[0].T, "o", mfc="white", color=COLORS["lost"], ms=4.5, label="stored")
     left.plot(*path[-1].T, "o", color=COLORS["lost"], ms=4.5, label="put back")
-    shades = [COLORS["base"], *mpl.colormaps["Blues"](np.linspace(0.4, 1.0, max(len(clouds) - 1, 1))).tolist()]
+    shades = [COLORS["gate"], *mpl.colormaps["Blues"](np.linspace(0.4, 1.0, max(len(clouds) - 1, 1))).tolist()]
     for (name, points), color in zip(clouds.items(), shades, strict=False):
         right.plot(*points.T, "o", ms=4, alpha=0.6, mew=0, color=color, label=name)
     left.set(ylabel="second number of the action", xlim=(axis[0], axis[-1]), ylim=(axis[0], axis[-1]))
@@ -103,6 +104,7 @@ def ascent_figure(axis: np.ndarray, value: np.ndarray, solved: np.ndarray, path:
     right.set_title("the policy follows")
     for ax in (left, right):
         ax.legend(fontsize=8.5, loc="lower left")
+    figure.suptitle(title, x=0.01, ha="left", weight="bold", fontsize=12)
     return figure
 
 

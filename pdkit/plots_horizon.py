@@ -14,6 +14,8 @@ from .plots_compare import over_seeds
 from .stats import wilson
 
 HORIZON = "horizon: share of the way to success that is left"
+WHO = {"random actions": COLORS["neither"], "base of the decorator": PALETTE[0], "base of fine-tuning": PALETTE[1],
+       "base of both": COLORS["base"]}  # the colours that the methods have which start from them
 
 
 def _horizons(ax: Axes, fractions) -> None:
@@ -51,7 +53,7 @@ def exploration_figure(table: pd.DataFrame, title: str = "", *, recorded: pd.Dat
     figure, axes = blank(1, 2, (9.4, 3.7))
     left, right = axes[0]
     for i, (who, rows) in enumerate(table.groupby("who", sort=False)):
-        rows, color = rows.sort_values("start_fraction"), PALETTE[i]
+        rows, color = rows.sort_values("start_fraction"), WHO.get(who, PALETTE[i])
         rates = [wilson(int(r.solved), int(r.episodes)) for r in rows.itertuples()]
         shift = 0.008 * (i - 1)  # side by side where they coincide
         x = 1 - rows.start_fraction.to_numpy() + shift
@@ -59,7 +61,7 @@ def exploration_figure(table: pd.DataFrame, title: str = "", *, recorded: pd.Dat
         left.errorbar(x, [r.value for r in rates], bars, fmt="-o", ms=4, lw=1.4, capsize=2, color=color, label=who)
         if recorded is not None:
             others = recorded[(recorded.who == who) & recorded.start_fraction.isin(rows.start_fraction)]
-            left.plot(1 - others.start_fraction + shift + 0.006, others.met, "o", ms=3.5, mew=0, alpha=0.5, color=color)
+            left.plot(1 - others.start_fraction + shift - 0.006, others.met, "o", ms=3.5, mew=0, alpha=0.5, color=color)
         met = rows.solved.to_numpy() > 0
         right.plot(x[met], rows.steps_per_reward[met], "-o", ms=4, color=color)
         right.plot(x[~met], rows.steps[~met], "^", ms=8, mfc="white", color=color)

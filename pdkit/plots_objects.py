@@ -108,6 +108,6 @@ def paths_figure(paths: Mapping[str, np.ndarray], label: str, chunk: int = 1, go
         ax.axhline(goal, color=COLORS["gained"], ls="--", lw=1.2, label="done")
         ax.set(title=name, xlabel="environment steps", ylim=(-0.03 * values.max(), 1.05 * values.max()))
     axes[0, 0].set_ylabel(label)
-    axes[0, -1].legend(loc="upper right", fontsize=8.5)
+    figure.legend(*axes[0, -1].get_legend_handles_labels(), loc="outside right upper", fontsize=8.5)
     figure.suptitle(title, x=0.01, ha="left", fontsize=11, weight="bold")
     return figure

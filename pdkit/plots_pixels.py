@@ -81,29 +81,31 @@ def memory_figure(table: pd.DataFrame, steps: int) -> Picture:
     ax.set_xscale("log")
     ax.set_yticks(y, table.task)
     ax.set_xlim(table.features.min() / 2, table.pictures.max() * 4)
-    ax.set_xlabel(f"gigabytes in a buffer of {steps:,} transitions")
+    ax.set_xlabel(f"gigabytes in a buffer of {steps:,} transitions (logarithmic: compare the numbers, not the bars' lengths)")
+    ax.set_title("What a buffer weighs")
     ax.legend(loc="lower right", fontsize=9)
     return figure
 
 
 @styled
-def training_figure(curves: pd.DataFrame, labels: Mapping[str, str], *, base: float | None = None) -> Picture:
+def training_figure(curves: pd.DataFrame, labels: Mapping[str, str], *, base: float | None = None, title: str = "") -> Picture:
     """Solved training episodes between logged steps, a line a recipe of `labels`, and evaluations as squares; dashed, the visual base.
 
     `curves` has recipe, step, train_success and, where it was evaluated, success_once.
     """
     figure, axes = blank(size=(7.2, 3.4))
     ax = axes[0, 0]
-    for recipe, colour in zip(labels, (COLORS["decorated"], COLORS["gate"], COLORS["lost"]), strict=False):
+    for recipe, colour in zip(labels, (COLORS["gate"], COLORS["decorated"], COLORS["lost"]), strict=False):
         rows = curves[curves.recipe == recipe].sort_values("step")
         known = rows.dropna(subset=["train_success"])
         ax.plot(known.step, known.train_success, "-o", ms=3.5, color=colour, label=labels[recipe])
         if "success_once" in rows:
             ax.plot(rows.step, rows.success_once, "s", ms=7, mfc="none", color=colour)
+    ax.plot([], [], "s", ms=7, mfc="none", color="0.3", label="evaluation, to the test's time limit")
     if base is not None:
         ax.axhline(base, color=COLORS["base"], ls="--", lw=1.2, label="visual base policy, test episodes")
-    _percent(ax, "training episodes solved")
-    ax.set(xlabel="environment steps", xlim=(0, None))
+    _percent(ax, "episodes solved")
+    ax.set(xlabel="environment steps", xlim=(0, None), title=title)
     ax.xaxis.set_major_formatter("{x:,.0f}")
     ax.legend(loc="lower right", fontsize=8.5)
     return figure

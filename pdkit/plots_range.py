@@ -62,7 +62,8 @@ def over_diffusion_figure(tasks: pd.DataFrame) -> Picture:
 def bounds_figure(table: pd.DataFrame, reached: pd.DataFrame | None = None, title: str = "") -> Picture:
     """A panel a task: success of a base policy that a demonstrator corrects, by the bound (rows of `oracle.by_bound`), with its intervals.
 
-    `reached` has task, alpha and success of decorated policies: a diamond at the bound that they were trained with.
+    `reached` has task, alpha and success of decorated policies: a diamond at the bound that they were trained with. alpha is logarithmic
+    above its least value, and linear below.
     """
     _columns(table, "task", "alpha", "success", "low", "high")
     tasks = list(dict.fromkeys(table.task))
@@ -85,10 +86,11 @@ def bounds_figure(table: pd.DataFrame, reached: pd.DataFrame | None = None, titl
     for ax in axes.flat[len(tasks):]:
         ax.set_visible(False)
     for ax in axes.flat[max(0, len(tasks) - axes.shape[1]):len(tasks)]:
-        ax.set_xlabel("alpha (logarithmic above the least)")
+        ax.set_xlabel("alpha")
     figure.supylabel("success within the episode", fontsize=9.5)
     figure.suptitle(title)
-    marks = [("o", COLORS["base"], "base, corrected by a demonstrator"), ("D", COLORS["decorated"], "decorated, at its own bound")]
+    marks = [("o", COLORS["base"], "base, corrected by a demonstrator (95 % intervals)"),
+             ("D", COLORS["decorated"], "decorated, at its own bound")]
     handles = [Line2D([], [], marker=m, ls="", color=color, label=label) for m, color, label in marks[: 1 + (reached is not None)]]
     figure.legend(handles=handles, loc="outside lower center", ncols=2, fontsize=8.5)
     return figure

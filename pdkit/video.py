@@ -198,23 +198,27 @@ def contrasts(spec: TaskSpec, base: Policy, decorated: Decorated, seeds: Sequenc
 # ---- contact sheets and videos ---------------------------------------------------------------------------------------
 
 @styled
-def contact_sheet(clips: Sequence[Clip], columns: int = 8, labels: Sequence[str] | None = None) -> Picture:
-    """One row an episode, `columns` frames at the same steps in all rows, the last at the end; green: solved by then.
+def contact_sheet(clips: Sequence[Clip], columns: int = 8, labels: Sequence[str] | None = None, alike: bool = True) -> Picture:
+    """One row an episode, `columns` frames, the last at the end, at the same steps in all rows or, not `alike`, at steps of the row's own
+    (where lengths differ much, a short episode would have but one frame); green: solved by then.
 
     Frames stand closer until a while after the last first success, because little happens later.
     """
     if not clips or not all(clip.frames for clip in clips):
         raise PdkitError("A contact sheet needs at least one recorded episode with frames.")
-    length = max(clip.length for clip in clips)
-    focus = min(length, int(1.5 * max((clip.first_success or 0 for clip in clips), default=0)) or length)
-    wanted = [*np.linspace(0, focus, columns - (focus < length)), *([length] if focus < length else [])]
+
+    def wanted(clips: Sequence[Clip]) -> list[float]:
+        length = max(clip.length for clip in clips)
+        focus = min(length, int(1.5 * max((clip.first_success or 0 for clip in clips), default=0)) or length)
+        return [*np.linspace(0, focus, columns - (focus < length)), *([length] if focus < length else [])]
+
     height, width = clips[0].frames[0].shape[:2]
     thumb, title = 1.35 * height / width, 0.24  # inches
     total = (thumb + title) * len(clips)
     figure, axes = blank(len(clips), columns, (1.35 * columns, total), layout=None)
     figure.subplots_adjust(0.003, 0.03 / total, 0.997, 1 - title / total, wspace=0.02, hspace=title / thumb)
     for row, clip in enumerate(clips):
-        for ax, step in zip(axes[row], wanted, strict=True):
+        for ax, step in zip(axes[row], wanted(clips if alike else [clip]), strict=True):
             i = int(np.abs(np.array(clip.steps) - step).argmin())
             _thumbnail(ax, clip.frames[i], clip.steps[i], clip.solved_by(clip.steps[i]))
         name = labels[row] if labels else clip.label
@@ -321,12 +325,13 @@ def film(clips: Sequence[Clip], path: str | Path, caption: str = "", *, fps: int
     return video_tag(written, caption) if written else ""
 
 
-def show(clips: Sequence[Clip], path: str | Path, caption: str = "", *, columns: int = 8) -> None:
-    """In a notebook: episodes as a contact sheet, and below it as a film side by side; kept as PATH.png and PATH.mp4."""
+def show(clips: Sequence[Clip], path: str | Path, caption: str = "", *, columns: int = 8, alike: bool = True) -> None:
+    """In a notebook: episodes as a contact sheet (`alike`: see there), and below it as a film side by side; kept as PATH.png and PATH.mp4.
+    """
     from IPython.display import HTML, display
 
     path = Path(path)
-    sheet = contact_sheet(clips, columns)
+    sheet = contact_sheet(clips, columns, alike=alike)
     sheet.savefig(path.with_suffix(".png"))
     display(sheet)
     if tag := film(clips, path.with_suffix(".mp4"), caption or ", ".join(clip.label for clip in clips) + ": the same episode"):

@@ -324,14 +324,24 @@ def test_a_matrix_writes_its_numbers():
 def test_the_trade_draws_runs_means_and_starts(table):
     table = table[table.recipe != "sac_from_scratch"].assign(decorated_jerk=[100, 200, 300, 40, 50, 60])
     own = runs("residual_rl", [0.3], decorated_jerk=500.0)
-    ax = plots_compare.trade_figure(table, labels={"residual_rl": "R", "policy_decorator": "D"}, own=own).axes[0]
+    labels = {"residual_rl": "R", "policy_decorator": "D"}
+    ax = plots_compare.trade_figure(table, labels=labels, own=own, starts=[("a BeT", 50.0, 0.5)]).axes[0]
     lines = {line.get_label(): line for line in ax.lines}
     assert lines["R"].get_xdata()[0] == pytest.approx(200) and lines["D"].get_ydata()[0] == pytest.approx(0.9)
     assert lines["R, your run"].get_xdata()[0] == 500 and ax.get_xscale() == "log"
     assert [line.get_xydata().tolist() for line in ax.lines if line.get_marker() == "X"] == [[[50.0, 0.5]]]
-    assert [text.get_text() for text in ax.texts] == ["start: bet"]
+    assert [text.get_text() for text in ax.texts] == ["start: a BeT"]
     with pytest.raises(PdkitError, match="both jerk and success"):
         plots_compare.trade_figure(table.assign(decorated_jerk=np.nan))
+
+
+def test_starting_points_are_those_of_methods_that_start_from_a_policy(table):
+    """One cross for a policy that several share, one for each of two lookups, and none for the yardstick of a method from scratch."""
+    table = pd.concat([table.assign(base_jerk=[50.0, 50.1, 49.9] * 2 + [9.0] * 3), runs("fish", [0.9], policy="vinn", base=0.93),
+                       runs("fish,features=GPT", [0.9], policy="vinn", base=0.88)])
+    points = compare.starting_points(table, {"fish": "FISH"})
+    assert points == [("the base policy", pytest.approx(50.0), 0.5), ("that of fish,features=GPT", 50.0, 0.88),
+                      ("that of FISH", 50.0, 0.93)]
 
 
 def test_differences_are_drawn_in_points_with_the_side_as_colour():
