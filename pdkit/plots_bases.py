@@ -56,7 +56,7 @@ def doubts_figure(doubts: Mapping[str, np.ndarray], along: Mapping[str, np.ndarr
         ax.set(title=name, xlabel="standard units", yticks=[], xlim=(-3, 3))
         ax.grid(visible=False)
     _percent(left, "steps with at most that doubt")
-    left.set(xlim=(-0.02, 1.05), xlabel="doubt: variance of neighbours' actions")
+    left.set(xlim=(-0.02, max(1.05, *(values.max() for values in doubts.values()))), xlabel="doubt: variance of neighbours' actions")
     left.legend(fontsize=8.5, loc="lower right")
     return figure
 

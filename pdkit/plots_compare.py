@@ -51,6 +51,13 @@ def nth(rows: pd.DataFrame) -> pd.api.typing.DataFrameGroupBy:
     return rows.assign(number=rows.groupby("seed").cumcount()).groupby("number")
 
 
+def dash(drawn: list[pd.Series], line: pd.Series) -> str:
+    """The style of a line: dashed where it lies on one that was `drawn` before, which would be hidden; it is added to these."""
+    hidden = any(line.equals(other) for other in drawn)
+    drawn.append(line)
+    return "--" if hidden else "-"
+
+
 def over_seeds(statistic: Callable[..., float], *arrays: np.ndarray, repetitions: int = 2000) -> Interval:
     """A statistic of one or two (runs x tasks) arrays with its bootstrap interval, which is NaN below three runs: one or two values would
     give one of no width."""
@@ -77,13 +84,14 @@ def curves_figure(curves: pd.DataFrame, *, column: str = "success_once", labels:
     names = labelled(curves, labels, own)
     color = colours(labels or names)
     figure, axes = blank(size=(7.6, 4.4))
-    ax = axes[0, 0]
+    ax, drawn = axes[0, 0], []
     for recipe, label in names.items():
         rows = curves[(curves.recipe == recipe) & curves[column].notna()]
         if len(rows):
             by = nth(rows)
             step, values = by.step.mean(), by[column]
-            ax.plot(step, values.mean(), "-o", ms=3.5, color=color[recipe], label=f"{label} ({rows.seed.nunique()})")
+            ax.plot(step, values.mean(), dash(drawn, values.mean()) + "o", ms=3.5, color=color[recipe],
+                    label=f"{label} ({rows.seed.nunique()})")
             ax.fill_between(step, values.min(), values.max(), color=color[recipe], alpha=0.13, lw=0)
         if starts and recipe in starts:
             ax.plot(0, starts[recipe], "s", ms=6, mfc="white", color=color[recipe], clip_on=False, zorder=4)
@@ -102,16 +110,16 @@ def curves_figure(curves: pd.DataFrame, *, column: str = "success_once", labels:
 @styled
 def finals_figure(table: pd.DataFrame, *, column: str = "decorated_success", labels: dict[str, str] | None = None,
                   base: float | None = None, own: pd.DataFrame | None = None, order: Sequence[str] = (), title: str = "",
-                  xlabel: str = "", log: bool = False) -> Picture:
+                  xlabel: str = "", log: bool = False, colors: Mapping[str, str] | None = None) -> Picture:
     """`column` at the end: a row a recipe with a dot a seed, the interquartile mean and its bootstrap interval over seeds.
 
     `own` holds the reader's rows, drawn as open circles; `order` names the recipes that come first, from the top, where that is another
-    order than that of the colours; the other arguments are those of `curves_figure`.
+    order than that of the colours; `colors` has those that differ from `colours`; the other arguments are those of `curves_figure`.
     """
     _columns(table, "recipe", "seed", column)
     names = labelled(table, labels, own)
     names = {recipe: names[recipe] for recipe in dict.fromkeys([*(r for r in order if r in names), *names])}
-    color, found = colours(labels or names), summary(table, column, labels).set_index("recipe")
+    color, found = colours(labels or names) | dict(colors or {}), summary(table, column, labels).set_index("recipe")
     figure, axes = blank(size=(7.2, 1.2 + 0.42 * len(names)))
     ax = axes[0, 0]
     for y, recipe in enumerate(reversed(names)):
@@ -150,6 +158,13 @@ def _values(ax: Axes, axis: str, column: str, label: str, log: bool) -> None:
         ax.xaxis.set_major_formatter(mpl.ticker.PercentFormatter(1.0, decimals=0))
     else:
         ax.set(**{f"{axis}label": label or column.replace("_", " "), f"{axis}scale": "log" if log else "linear"})
+        if log:
+            one = ax.xaxis if axis == "x" else ax.yaxis
+            low, high = one.get_view_interval()
+            subs = (1, 1.5, 2, 3, 5, 7) if high < 10 * low else (1, 2, 5) if high < 100 * low else (1,)
+            one.set_major_locator(mpl.ticker.LogLocator(subs=subs))
+            one.set_major_formatter(mpl.ticker.FuncFormatter(lambda value, _: f"{value:,.3g}" if value < 1000 else f"{value:,.0f}"))
+            one.set_minor_formatter(mpl.ticker.NullFormatter())
 
 
 # ---- many recipes ----------------------------------------------------------------------------------------------------
@@ -174,10 +189,10 @@ def panels_figure(curves: pd.DataFrame, panels: Mapping[str, Sequence[str]], *, 
     figure, axes = blank(-(-count // 2), min(count, 2), (6.6 * min(count, 2), 0.4 + 2.9 * -(-count // 2)), sharex=True, sharey=True)
     for ax, (family, members) in zip(axes.flat, panels.items(), strict=False):
         if reference and reference not in members:
-            _band(ax, curves, reference, column, "#9a9a9a", names.get(reference, reference))
-        mine = [recipe for recipe in names if recipe in members]
+            _band(ax, curves, reference, column, "#9a9a9a", names.get(reference, reference), [])
+        mine, drawn = [recipe for recipe in names if recipe in members], []
         for above, recipe in zip(reversed(range(len(mine))), mine, strict=True):
-            _band(ax, curves, recipe, column, color[recipe], names[recipe])
+            _band(ax, curves, recipe, column, color[recipe], names[recipe], drawn)
             if starts and recipe in starts:  # a square in the other where they coincide
                 ax.plot(0, starts[recipe], "s", ms=5 + 2 * above, mfc="white", color=color[recipe], clip_on=False, zorder=4)
             if own is not None and len(yours := own[(own.recipe == recipe) & own[column].notna()]):
@@ -198,15 +213,16 @@ def panels_figure(curves: pd.DataFrame, panels: Mapping[str, Sequence[str]], *, 
     return figure
 
 
-def _band(ax: Axes, curves: pd.DataFrame, recipe: str, column: str, color: str, label: str) -> None:
-    """The mean over seeds at each evaluation, and its bootstrap interval where there are several seeds."""
+def _band(ax: Axes, curves: pd.DataFrame, recipe: str, column: str, color: str, label: str, drawn: list[pd.Series]) -> None:
+    """The mean over seeds at each evaluation, and its bootstrap interval where there are several seeds (`drawn`: see `dash`)."""
     rows = curves[(curves.recipe == recipe) & curves[column].notna()].sort_values("step")
     if rows.empty:
         return
     by = nth(rows)
     step = by.step.mean()
     limits = [over_seeds(np.mean, values.to_numpy()[:, None], repetitions=500) for _, values in by[column]]
-    ax.plot(step, [i.value for i in limits], "-o", ms=3.5, color=color, label=f"{label} ({rows.seed.nunique()})")
+    ax.plot(step, [i.value for i in limits], dash(drawn, by[column].mean()) + "o", ms=3.5, color=color,
+            label=f"{label} ({rows.seed.nunique()})")
     ax.fill_between(step, [i.low for i in limits], [i.high for i in limits], color=color, alpha=0.15, lw=0)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 
 from .plots import COLORS, Picture, _columns, _percent, blank, styled
-from .plots_compare import colours, thousands
+from .plots_compare import colours, dash, thousands
 
 VALUES = {"data": "actions of the data", "policy": "the policy's actions", "random": "random actions"}
 SOURCES = {"demonstrations": COLORS["gained"], "rollouts": COLORS["lost"]}
@@ -147,9 +147,7 @@ def offline_figure(curves: pd.DataFrame, labels: Mapping[str, str], own: pd.Data
             rows = curves[(curves.recipe == recipe) & (curves.step == 0)]
             if len(rows):
                 line = rows.groupby("updates")[column].mean()
-                same = any(line.equals(other) for other in drawn)  # setups with the same offline stage: neither is hidden
-                drawn.append(line)
-                ax.plot(line, "--" if same else "-", color=color[recipe], lw=1.4 if same else 2.2, label=f"{label} ({rows.seed.nunique()})")
+                ax.plot(line, dash(drawn, line), color=color[recipe], label=f"{label} ({rows.seed.nunique()})")
             if own is not None and len(mine := own[(own.recipe == recipe) & (own.step == 0)]):
                 ax.plot(mine.updates, mine[column], ":o", ms=4, mfc="white", color=color[recipe], label=f"{label}, your run")
         ax.set(xlabel="offline updates", xlim=(0, None))

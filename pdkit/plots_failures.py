@@ -1,7 +1,7 @@
 """Figures of the failure analyses (notebooks 06 and 07), in the look of plots.py: each returns a Figure."""
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import matplotlib as mpl
 import numpy as np
@@ -9,11 +9,17 @@ import pandas as pd
 from matplotlib.patches import Patch
 
 from .plots import COLORS, Picture, blank, styled
+from .plots_compare import colours
 from .stats import Rate
 
 ARMS = {"random critic": "#d1495b", "critic alone": "#e0a030", "critic learns": "#3c3c46",
         "decorated, pushed": "#6aaed6", "decorated, no entropy": "#3fa7a0", "decorated": COLORS["decorated"]}
 OTHERS = ("#2c9f6b", "#8f5fb0", "#b07a3c", "#7d7d7d")  # for arms without a colour of their own
+
+
+def arm_colors(names: Iterable[str]) -> dict[str, str]:
+    """The colour of each, by the arm that the name begins with."""
+    return {name: next((c for arm, c in ARMS.items() if name.startswith(arm)), COLORS["base"]) for name in names}
 
 
 @styled
@@ -43,7 +49,8 @@ def directions_figure(cosines: Sequence[np.ndarray], dim: int, sizes: dict[str, 
     ax.set_xticks(range(len(sizes)), list(sizes))
     ax.set_xlim(-0.6, len(sizes) - 0.4)
     ax.grid(axis="x", visible=False)
-    ax.set_title("How hard (mean per dimension)")
+    ax.set_ylabel("mean size per dimension")
+    ax.set_title("How hard")
     return figure
 
 
@@ -78,10 +85,9 @@ def drift_figure(drifts: pd.DataFrame, *, bound: float, distance: float) -> Pict
 def costs_figure(rates: dict[str, Rate], *, title: str = "") -> Picture:
     """Named success rates as horizontal bars with intervals, coloured by the arm that the name begins with."""
     figure, axes = blank(size=(7.6, 0.7 + 0.34 * len(rates)))
-    ax = axes[0, 0]
+    ax, colors = axes[0, 0], arm_colors(rates)
     for y, (name, rate) in enumerate(rates.items()):
-        color = next((c for arm, c in ARMS.items() if name.startswith(arm)), COLORS["base"])
-        ax.barh(y, rate.value, 0.66, color=color, alpha=0.85)
+        ax.barh(y, rate.value, 0.66, color=colors[name], alpha=0.85)
         ax.errorbar(rate.value, y, xerr=[[rate.value - rate.low], [rate.high - rate.value]], color="black", capsize=3, lw=1.1)
         ax.text(1.03, y, f"{rate.value:.0%}", va="center", fontsize=9)
     ax.set_yticks(range(len(rates)), list(rates))
@@ -97,7 +103,7 @@ def warm_figure(rows: pd.DataFrame, *, warmup: int, bound: float, target: float)
     """Temperature, entropy against its target, and mean Q over updates, a line for each arm (columns arm, update, temperature,
     entropy, q_mean); grey: while the actor of the warm-started arms stands still."""
     figure, axes = blank(1, 3, (10.8, 3.5))
-    colors = dict(zip(rows.arm.unique(), ("#d1495b", COLORS["decorated"], "#e0a030", *OTHERS), strict=False))
+    colors = colours(dict.fromkeys(rows.arm))
     titles = {"temperature": "Temperature", "entropy": "Entropy of the actor", "q_mean": "Mean Q"}
     for ax, (column, title) in zip(axes[0], titles.items(), strict=True):
         ax.axvspan(0, warmup, color="#f0f0f0", lw=0)

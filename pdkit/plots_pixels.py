@@ -81,7 +81,7 @@ def memory_figure(table: pd.DataFrame, steps: int) -> Picture:
     ax.set_xscale("log")
     ax.set_yticks(y, table.task)
     ax.set_xlim(table.features.min() / 2, table.pictures.max() * 4)
-    ax.set_xlabel(f"gigabytes in a buffer of {steps:,} transitions (logarithmic: compare the numbers, not the bars' lengths)")
+    ax.set_xlabel(f"gigabytes in a buffer of {steps:,} transitions (logarithmic)")
     ax.set_title("What a buffer weighs")
     ax.legend(loc="lower right", fontsize=9)
     return figure

@@ -216,7 +216,8 @@ def clamped_log_pi(actor: nn.Module, limit: float) -> Iterator[None]:
 
 def unlearning_verdict(few: Paired, many: Paired, guarded: Paired) -> tuple[str, list[str]]:
     """F.2 from three comparisons with the policy before any update: after few and many updates by a random critic, and the same
-    number of updates of a bounded residual. A fall or its absence is judged by the 95 % interval of the paired difference."""
+    number of updates of a bounded residual. A fall or its absence is judged by the 95 % interval of the paired difference; "untested" for
+    a policy that solves nothing, and has nothing to lose."""
     falls, falls_early, keeps = many.high < 0, few.high < 0, guarded.low <= 0 <= guarded.high
     reasons = [
         _said("after few updates", few, "it falls" if falls_early else "no fall that this many episodes can show"),
@@ -226,7 +227,7 @@ def unlearning_verdict(few: Paired, many: Paired, guarded: Paired) -> tuple[str,
     ]
     if falls and many.difference <= few.difference:
         return ("reproduced" if falls_early else "partly"), reasons
-    return "not", reasons
+    return ("not" if many.base.value > 0 else "untested"), reasons
 
 
 def _said(what: str, result: Paired, words: str) -> str:
