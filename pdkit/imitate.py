@@ -20,10 +20,13 @@ from .evaluate import selection_scores
 from .gradient_steps import GradientSteps, make_optimizer
 from .policies import POLICIES, Policy
 from .profiles import checked
+from .rl.state import pack, unpack
+from .runs import Run
 from .tasks import get_task
 from .tasks.spec import TaskSpec
 
 SCHEDULES = ("constant", "cosine")
+EARLY = 10  # gradient steps after which it is known how long they take
 
 
 @dataclass(frozen=True)
@@ -161,6 +164,20 @@ class Average:
         finally:
             self._ema.restore(self._parameters)
 
+    def pack(self) -> dict[str, torch.Tensor]:
+        """What a checkpoint needs of it, by name."""
+        if not self._ema:
+            return {}
+        return {f"average.{i}": value for i, value in enumerate(self._ema.shadow_params)} | {
+            "average.steps": torch.tensor(self._ema.optimization_step)}
+
+    def unpack(self, tensors: dict[str, torch.Tensor]) -> None:
+        """Restore what `pack` gave."""
+        if self._ema:
+            for i, value in enumerate(self._ema.shadow_params):
+                value.copy_(tensors[f"average.{i}"])
+            self._ema.optimization_step = int(tensors["average.steps"])
+
 
 def _checkpoint_row(iteration: int, started: float, terms: dict[str, torch.Tensor], lr: float) -> dict[str, float]:
     """iteration, seconds since `started` and the loss terms. Raises PdkitError for a loss that is no number."""
@@ -171,8 +188,10 @@ def _checkpoint_row(iteration: int, started: float, terms: dict[str, torch.Tenso
 
 
 def imitate(kind: str, demos: Demos, config: ImitateConfig | None = None, policy_config: dict | None = None, *, device: str = "cpu",
-            progress: Callable[[dict], None] | None = None, spec: TaskSpec | None = None) -> tuple[Policy, list[dict]]:
-    """Train a policy of `kind` on `demos`; `spec` is for worlds outside the registry, such as the probes.
+            progress: Callable[[dict], None] | None = None, spec: TaskSpec | None = None, run: Run | None = None
+            ) -> tuple[Policy, list[dict]]:
+    """Train a policy of `kind` on `demos`; `spec` is for worlds outside the registry, such as the probes. With a `run` the training is
+    saved there at each checkpoint and goes on from there, to the same numbers (on a GPU dropout draws others).
 
     Returns the selected policy in evaluation mode, on `device`, and one row per checkpoint: iteration, loss terms, seconds and, when
     evaluated, success_once and success_at_end on the selection seeds. A policy without gradient steps, such as VINN, is only
@@ -207,25 +226,66 @@ def imitate(kind: str, demos: Demos, config: ImitateConfig | None = None, policy
         policy.train()
         return {k: v.clone() for k, v in policy.state_dict().items()}, scores
 
-    best, history = best_checkpoint(config, lambda: step(*batch()), optimizer, average, candidate, progress)
+    saved = run and Saved(run, {"policy": policy}, optimizer, average, generator)
+    best, history = best_checkpoint(config, lambda: step(*batch()), optimizer, average, candidate, progress, saved)
     policy.load_state_dict(best)
     return policy.eval(), history
 
 
+class Saved:
+    """A training of imitation in a run's folder: everything that the rest of it depends on.
+
+    Args:
+        networks: what is trained, by name; its optimizer and average.
+        batches: the generator that draws the batches. All else is drawn by torch's own, on the CPU.
+    """
+
+    def __init__(self, run: Run, networks: dict[str, nn.Module], optimizer: torch.optim.Optimizer, average: Average,
+                 batches: torch.Generator):
+        self._run, self._parts, self._average, self._batches = run, (networks, {"optimizer": optimizer}), average, batches
+
+    def save(self, history: list[dict], best: float, chosen: dict[str, torch.Tensor]) -> None:
+        """Write it; `chosen` is the best candidate so far, and `best` its score."""
+        tensors = pack(*self._parts) | self._average.pack() | {f"chosen.{name}": value for name, value in chosen.items()}
+        tensors |= {"batches": self._batches.get_state(), "torch": torch.get_rng_state()}
+        arrays = {name: value.detach().cpu().numpy() for name, value in tensors.items()}
+        self._run.save_checkpoint(arrays, {"step": history[-1]["iteration"], "history": history, "best": best})
+
+    def load(self) -> tuple[list[dict], float, dict[str, torch.Tensor]]:
+        """What `save` was given, once the training stands where it did; nothing where nothing was saved."""
+        if not self._run.has_checkpoint:
+            return [], -1.0, {}
+        arrays, values = self._run.load_checkpoint()
+        tensors = {name: torch.from_numpy(value) for name, value in arrays.items()}
+        unpack(tensors, *self._parts)
+        self._average.unpack(tensors)
+        self._batches.set_state(tensors["batches"])
+        torch.set_rng_state(tensors["torch"])
+        chosen = {name.removeprefix("chosen."): value for name, value in tensors.items() if name.startswith("chosen.")}
+        return values["history"], values["best"], chosen
+
+
 def best_checkpoint(config: ImitateConfig, step: Callable[[], dict[str, torch.Tensor]], optimizer: torch.optim.Optimizer, average: Average,
-                    candidate: Callable[[], tuple[Any, dict[str, float]]], progress: Callable[[dict], None] | None
-                    ) -> tuple[Any, list[dict]]:
+                    candidate: Callable[[], tuple[dict[str, torch.Tensor], dict[str, float]]], progress: Callable[[dict], None] | None,
+                    saved: Saved | None = None) -> tuple[dict[str, torch.Tensor], list[dict]]:
     """Make `config.iterations` gradient steps; the best candidate by its success_once (without evaluations the latest), and one row
     a checkpoint. `step` makes a gradient step and gives its loss terms; `candidate` gives what may be chosen, and its scores, and is
-    called while the weights are the averaged ones. Raises PdkitError for a loss that is no number.
+    called while the weights are the averaged ones. What was `saved` is not done again. `progress` is given each row, and before the first
+    one what EARLY steps took. Raises PdkitError for a loss that is no number.
     """
-    rates = torch.optim.lr_scheduler.LambdaLR(optimizer, config.lr_factor)
-    history, best, chosen, started = [], -1.0, None, time.monotonic()
-    for iteration in range(1, config.iterations + 1):
+    history, best, chosen = saved.load() if saved else ([], -1.0, {})
+    done, started = (history[-1]["iteration"], time.monotonic() - history[-1]["seconds"]) if history else (0, time.monotonic())
+    for group in optimizer.param_groups if done else ():
+        lr = group["lr"]  # a tensor that the scheduler fills where steps are recorded
+        group["initial_lr"] = lr.clone() if isinstance(lr, torch.Tensor) else lr
+    rates = torch.optim.lr_scheduler.LambdaLR(optimizer, config.lr_factor, last_epoch=done - 1)
+    for iteration in range(done + 1, config.iterations + 1):
         terms = step()
         rates.step()
         average.step()
         if iteration % config.eval_every and iteration < config.iterations:
+            if progress and iteration == EARLY:
+                progress({"iteration": iteration, "seconds": time.monotonic() - started})
             continue
         row = _checkpoint_row(iteration, started, terms, config.lr)
         with average.in_place():
@@ -235,6 +295,8 @@ def best_checkpoint(config: ImitateConfig, step: Callable[[], dict[str, torch.Te
         if score > best:
             best, chosen = score, it
         history.append(row)
+        if saved:
+            saved.save(history, best, chosen)
         if progress:
             progress(row)
     return chosen, history

@@ -51,6 +51,18 @@ _PAPER_DIFFUSION_TASK: dict[str, dict[str, Any]] = {
 _PAPER_VISUAL: dict[str, Any] = _PAPER_DIFFUSION | dict(total_steps=2_000_000, alpha=0.05, H=30_000, batch=256)
 _PAPER_VISUAL_TASK: dict[str, dict[str, Any]] = {"PushChair": dict(total_steps=5_000_000, alpha=0.2, H=100_000)}
 
+# Base policies as the official code imitates them (facts.md 2.1, 2.2): of two families, on ManiSkill's tasks; elsewhere its defaults
+# stand in. What is not here is the family's own default already.
+_PAPER_BASE: dict[str, dict[str, Any]] = {
+    "bet": dict(window=20, act_dropout=True, iterations=200_000, batch=2_048, lr=1e-4, pad_start=False, eval_every=5_000,
+                eval_episodes=100, bf16=False),
+    "diffusion": dict(iterations=1_000_000, batch=1_024, eval_every=10_000, eval_episodes=100, bf16=False),
+}
+_PAPER_BASE_TASK: dict[str, dict[str, dict[str, Any]]] = {
+    "bet": {"StackCube": dict(lr=1e-3, batch=4_096), "PegInsertionSide": dict(embed=256), "PushChair": dict(bins=16)},
+    "diffusion": {"PushChair": dict(iterations=300_000)},
+}
+
 _LESSON: dict[str, Any] = {}  # the defaults of OnlineConfig, DecoratorConfig and SACConfig
 _LESSON_TASK: dict[str, dict[str, Any]] = {
     "Door": dict(train_limit=120),
@@ -122,6 +134,21 @@ def policy_values(task: str, profile: str, kind: str, chunk: int, visual: bool =
         return {}
     usual = online_config(task, profile)
     return {"gamma": round(usual.gamma**chunk, 3), "n_step": -(-usual.n_step // chunk)}
+
+
+def base_values(kind: str, task: str, profile: str, visual: bool = False) -> dict[str, Any]:
+    """What a profile sets for the training of a base policy of this kind, by flat name; `visual`: from pictures. "lesson" is the defaults,
+    which a CPU trains in minutes. Raises PdkitError for another profile than this and "paper", and for "paper" where its numbers are not
+    known."""
+    if profile == "lesson":
+        return {}
+    if profile != "paper":
+        raise unknown("profile of a base policy", profile, ("lesson", "paper"))
+    if kind not in _PAPER_BASE:
+        raise PdkitError(f"The paper's settings of a base policy of kind {kind} are not known, only those of {' and '.join(_PAPER_BASE)}; "
+                         "leave --profile out, and give your own by --set.")
+    of_task = _PAPER_BASE_TASK[kind].get(_like(task), {})
+    return _PAPER_BASE[kind] | of_task | ({"batch": 256} if visual and kind == "diffusion" else {})
 
 
 def online_config(task: str, profile: str = "lesson", seed: int = 0, /, **changes: Any) -> OnlineConfig:

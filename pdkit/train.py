@@ -2,11 +2,14 @@
 from __future__ import annotations
 
 import ast
+import contextlib
 import hashlib
 import json
 import math
 import shlex
+import shutil
 import sys
+from collections.abc import Iterator
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
@@ -22,6 +25,7 @@ from .evaluate import evaluate
 from .files import DATA, atomic_file, atomic_folder, check_replaceable, code_checksum, read_json, runs_root, write_json
 from .imitate import configured, imitate
 from .machine import load_average
+from .main_job import duration
 from .methods import METHODS
 from .methods.registry import base_folder as shipped_base
 from .methods.registry import make_trainer, method_config, trainer_of
@@ -34,7 +38,7 @@ from .pixels.pictures import encoded, pictures_of
 from .pixels.task import ENCODER, encoder_of, pixel_spec, save_visual
 from .policies import POLICIES, Policy, load_policy, save_policy
 from .policies.base import read_card
-from .profiles import PROFILES, differences, flat
+from .profiles import PROFILES, base_values, differences, flat
 from .recorded import SETTINGS, mark, record, told_of
 from .runs import Run, commits, describe_machine, kept_so_far, origin
 from .seeds import reported_seeds
@@ -51,6 +55,8 @@ def main(argv: list[str]) -> int:
     kinds = parser.add_subparsers(dest="kind", required=True, parser_class=Parser)
     base = kinds.add_parser("base", help="imitate demonstrations")
     base.add_argument("task")
+    base.add_argument("--profile", default="lesson", help="lesson (the defaults: minutes on a CPU) or paper (the official code's "
+                                                         "settings, for bet and diffusion: days)")
     base.add_argument("--policy", default="bet", help=f"one of: {', '.join(POLICIES)}")
     base.add_argument("--demos", help="demonstration file (default: the bundled one)")
     base.add_argument("--num-demos", type=int, help="use only the first so many")
@@ -104,7 +110,8 @@ def base_demos(args) -> Demos:
 def _base(args) -> int:
     if args.episodes < 0:
         raise PdkitError("--episodes must be 0 (no test) or more.")
-    demos, settings = base_demos(args), parse_settings(args.set)
+    demos = base_demos(args)
+    settings = base_values(args.policy, args.task, args.profile, args.pixels) | parse_settings(args.set)
     shift, eyes = (settings.pop(name, None) if args.pixels else None for name in ("random_shift", "encoder"))
     if args.pixels:
         check_pixels(args.policy, shift, view_of(args.task), eyes)
@@ -118,21 +125,30 @@ def _base(args) -> int:
     print(f"{args.policy} on {demos.num} demonstrations of {args.task} ({demos.label}), on {device}: {config}", flush=True)
 
     def show(row: dict[str, float]) -> None:
-        print("  " + ", ".join(f"{k} {v:.3g}" for k, v in row.items()), flush=True)
+        left = row["seconds"] / max(1, row["iteration"]) * (config.iterations - row["iteration"]) if row["iteration"] else 0.0
+        text = ", ".join(f"{k} {v:,}" if k == "iteration" else f"{k} {v:.3g}" for k, v in row.items())
+        print(f"  {text}" + (f"; {duration(left / 60)} left" if left else ""), flush=True)
 
+    pictures = None
     if args.pixels:
         # Wrong settings are refused before anything is drawn.
         POLICIES[args.policy](visual_settings(args.policy, view_of(args.task), get_task(args.task)) | architecture)
         if encoder:
             pixel_spec(get_task(args.task), encoder)
         pictures = pictures_of(demos, Progress(demos.num, "drawn"))
-        if encoder:
-            policy, history = look_up(demos, pictures, encoder, config, architecture, progress=show)
-        else:
-            policy, encoder, history = imitate_pixels(args.policy, demos, pictures, config, architecture, shift=shift, device=device,
-                                                      progress=show)
-    else:
-        policy, history = imitate(args.policy, demos, config, architecture, device=device, progress=show)
+    folder = out.with_name(f"{out.name}.training")
+    try:
+        with _training(folder, args.policy, demos, asdict(config) | architecture | ({"random_shift": shift} if pictures else {})) as run:
+            if encoder:
+                policy, history = look_up(demos, pictures, encoder, config, architecture, progress=show)
+            elif pictures:
+                policy, encoder, history = imitate_pixels(args.policy, demos, pictures, config, architecture, shift=shift, device=device,
+                                                          progress=show, run=run)
+            else:
+                policy, history = imitate(args.policy, demos, config, architecture, device=device, progress=show, run=run)
+    except KeyboardInterrupt:
+        print(f"\nInterrupted. {kept_so_far(folder)} the same command.", file=sys.stderr)
+        return 130
     best = max(history, key=lambda row: row.get("success_once", row["iteration"]))
     info = {"task": args.task, "demos": demos.num, "demos_checksum": demos.checksum, "label": demos.label, "imitate": asdict(config),
             "selected": best, "seconds": history[-1]["seconds"], "command": shlex.join(["pdkit", "train", *sys.argv[2:]]), "device": device,
@@ -141,6 +157,7 @@ def _base(args) -> int:
         save_visual(policy, encoder, out, info)
     else:
         save_policy(policy, out, info)
+    shutil.rmtree(folder, ignore_errors=True)
     print(f"wrote {out}", flush=True)
     if args.episodes:  # after the policy is safe
         spec = pixel_spec(get_task(args.task), encoder) if encoder else get_task(args.task)
@@ -148,6 +165,18 @@ def _base(args) -> int:
         write_json(out / "policy.json", read_card(out) | {"info": info | {"test": test}})
         print("  " + ", ".join(f"{k} {v}" for k, v in test.items()), flush=True)
     return 0
+
+
+@contextlib.contextmanager
+def _training(folder: Path, kind: str, demos: Demos, settings: dict[str, Any]) -> Iterator[Run]:
+    """The run of an imitation that is not done: its folder stays if there is anything to go on from."""
+    run = Run(folder, "base", {"policy": kind, "task": demos.task, "demos": demos.checksum, "num_demos": demos.num} | settings)
+    try:
+        with run.alone():
+            yield run
+    finally:
+        if not run.has_checkpoint:
+            shutil.rmtree(folder, ignore_errors=True)
 
 
 def _decorated(args) -> int:

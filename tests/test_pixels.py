@@ -436,6 +436,29 @@ def test_pictures_are_shifted_while_a_policy_learns_from_them(monkeypatch):
         assert shifts == 3 * [shifted] * (shifted > 0) and sum(sevens) == 3 * (shifted > 0)  # what is shifted is what is seen
 
 
+def test_an_interrupted_training_from_pictures_goes_on_to_the_same_policy_and_encoder(tmp_path, monkeypatch):
+    monkeypatch.setitem(pixel_sim.EYES, "probe", Painted)
+    demos = reach_demos(2)
+    pictures = draw(demos, spec=PROBES["reach"], view=REACH)
+    config = ImitateConfig(iterations=4, batch=8, eval_every=2, eval_episodes=0, bf16=False)
+
+    def train(run=None, progress=None):
+        return imitate_pixels("mlp", demos, pictures, config, {"hidden": 16}, spec=PROBES["reach"], view=REACH, shift=2, run=run,
+                              progress=progress)
+
+    def interrupt(row):
+        raise KeyboardInterrupt
+
+    *whole, history = train()
+    with pytest.raises(KeyboardInterrupt):
+        train(Run(tmp_path, "base", {}), interrupt)
+    torch.manual_seed(99)
+    *again, rows = train(Run(tmp_path, "base", {}))
+    assert [row["loss"] for row in rows] == [row["loss"] for row in history]
+    for one, other in zip(whole, again, strict=True):
+        assert all(torch.equal(value, one.state_dict()[name]) for name, value in other.state_dict().items())
+
+
 def test_what_imitation_leaves(sighted):
     policy, encoder, seen = sighted
     np.testing.assert_allclose(policy.normalizer.mean.numpy(), seen.observations.mean(0), atol=1e-4)  # of the features too

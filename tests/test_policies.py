@@ -11,10 +11,12 @@ from pdkit import train
 from pdkit.demos.format import from_episodes
 from pdkit.errors import PdkitError
 from pdkit.gradient_steps import make_optimizer
-from pdkit.imitate import Average, ImitateConfig, Windows, best_checkpoint, imitate, untrained
+from pdkit.imitate import Average, ImitateConfig, Windows, best_checkpoint, configured, imitate, untrained
 from pdkit.policies import POLICIES, BeT, load_policy, save_policy
 from pdkit.policies.base import Normalizer, share_weights
 from pdkit.policies.bet import focal_loss
+from pdkit.profiles import base_values
+from pdkit.runs import Run
 from pdkit.seeds import DEMOS, SELECT, TEST, TRAIN, reported_seeds, rollout_seeds, selection_seeds, training_seed
 from pdkit.tasks import get_task
 
@@ -212,6 +214,62 @@ def test_the_best_of_the_evaluations_is_kept_and_training_goes_on_as_before(monk
     assert modes == 3 * [True, True, False] and not policy.training
 
 
+@pytest.mark.parametrize(("kind", "task", "visual", "wanted"), [  # facts.md 2.1, 2.2
+    ("bet", "TurnFaucet", False, dict(
+        iterations=200_000, batch=2_048, lr=1e-4, schedule="constant", weight_decay=2e-4, beta1=0.9, window=20, bins=8, layers=4, heads=4,
+        embed=128, features=256, dropout=0.1, act_dropout=True, pad_start=False, eval_every=5_000, eval_episodes=100, focal_gamma=2.0,
+        offset_weight=1_000.0)),
+    ("bet", "StackCube", False, dict(batch=4_096, lr=1e-3, embed=128, bins=8)),
+    ("bet", "PegInsertionSide", False, dict(embed=256, lr=1e-4)),
+    ("bet", "PushChair", False, dict(bins=16, batch=2_048)), ("bet", "Door", False, dict(window=20, batch=2_048, bins=8)),
+    ("diffusion", "TurnFaucet", False, dict(
+        iterations=1_000_000, batch=1_024, lr=1e-4, beta1=0.95, weight_decay=1e-6, schedule="cosine", lr_warmup=500, ema_power=0.75,
+        eval_every=10_000, eval_episodes=100, window=2, horizon=16, chunk=4, dims=[64, 128, 256], prediction="epsilon", spacing="leading",
+        diffusion_steps=100)),
+    ("diffusion", "PushChair", True, dict(iterations=300_000, batch=256))])
+def test_the_papers_base_policies(kind, task, visual, wanted):
+    config, architecture = configured(kind, base_values(kind, task, "paper", visual))
+    policy = untrained(kind, get_task(task), architecture)
+    assert wanted.items() <= (vars(config) | policy.config).items() and not config.bf16
+    assert base_values(kind, task, "lesson") == {}
+
+
+@pytest.mark.parametrize(("kind", "profile", "said"), [("mlp", "paper", "of kind mlp are not known"), ("bet", "smoke", "Unknown profile")])
+def test_a_base_policy_of_unknown_scale_is_refused(kind, profile, said):
+    with pytest.raises(PdkitError, match=said):
+        base_values(kind, "Door", profile)
+
+
+@pytest.mark.parametrize(("kind", "tiny"), [
+    ("bet", dict(window=4, bins=2, layers=1, heads=2, embed=16, features=16)),  # with dropout
+    ("diffusion", dict(horizon=4, chunk=1, dims=[16, 32], groups=4, embed=16))])  # with noise and an average
+@pytest.mark.parametrize("scores", [(0.9, 0.1, 0.2, 0.3), (0.1, 0.2, 0.3, 0.4)], ids=["the first", "the last"])
+def test_an_interrupted_imitation_goes_on_to_the_same_policy(kind, tiny, scores, tmp_path, monkeypatch):
+    """Whichever checkpoint is the best, and making no gradient step twice."""
+    settings = ImitateConfig(**POLICIES[kind].recipe | dict(iterations=12, batch=16, lr=1e-2, eval_every=3, lr_warmup=5, schedule="cosine"))
+    steps, loss = [], POLICIES[kind].loss
+    monkeypatch.setattr(POLICIES[kind], "loss", lambda *batch: steps.append(1) or loss(*batch))
+
+    def train(left, run=None, progress=None):
+        left = iter(left)
+        monkeypatch.setattr("pdkit.imitate.selection_scores", lambda *_: {"success_once": next(left), "success_at_end": 0.0})
+        return imitate(kind, line_demos(), settings, tiny, run=run, progress=progress)
+
+    def interrupt(row):
+        if row["iteration"] == 6:
+            raise KeyboardInterrupt
+
+    whole, history = train(scores)
+    with pytest.raises(KeyboardInterrupt):
+        train(scores, Run(tmp_path, "base", {}), interrupt)
+    torch.manual_seed(99)
+    steps.clear()
+    again, rows = train(scores[2:], Run(tmp_path, "base", {}))
+    assert len(steps) == 6 and [row["success_once"] for row in rows] == list(scores)
+    assert [row["loss"] for row in rows] == [row["loss"] for row in history] and rows[-1]["seconds"] > rows[0]["seconds"]
+    assert all(torch.equal(value, whole.state_dict()[name]) for name, value in again.state_dict().items())
+
+
 def test_every_gradient_step_has_the_rate_of_the_schedule():
     weight = torch.nn.Parameter(torch.zeros(()))
     settings = ImitateConfig(iterations=6, eval_every=6, lr=0.5, schedule="cosine", lr_warmup=2)
@@ -222,7 +280,7 @@ def test_every_gradient_step_has_the_rate_of_the_schedule():
         optimizer.step()
         return {"loss": torch.zeros(())}
 
-    best_checkpoint(settings, step, optimizer, Average([weight], 0.0), lambda: (None, {}), None)
+    best_checkpoint(settings, step, optimizer, Average([weight], 0.0), lambda: ({}, {}), None)
     assert rates == pytest.approx([0, 0.25, 0.5, 0.25 * (1 + 0.5**0.5), 0.25, 0.25 * (1 - 0.5**0.5)])
 
 

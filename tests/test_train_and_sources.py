@@ -13,12 +13,13 @@ from worlds import reach_demos
 
 import pdkit.demos.sources as sources
 import pdkit.recorded as recorded
-from pdkit import cli, report, train
+from pdkit import cli, imitate, report, train
 from pdkit.decorated import load_decorated
 from pdkit.demos import load_demos, save_demos
 from pdkit.errors import PdkitError
 from pdkit.files import DATA
 from pdkit.policies import BeT, load_policy
+from pdkit.policies.base import read_card
 from pdkit.policies.diffusion import DiffusionPolicy
 from pdkit.probes import PROBES, ProbeBase
 from pdkit.profiles import online_config
@@ -297,6 +298,33 @@ def test_tensorboard_gets_every_number_at_its_step(tmp_path):
     assert sorted(events.Tags()["scalars"]) == ["q_mean", "success_once"]
     assert [(e.step, e.value) for e in events.Scalars("q_mean")] == [(100, -2.0), (200, -1.5)]
     assert [(e.step, e.value) for e in events.Scalars("success_once")] == [(100, 0.5)]
+
+
+def test_an_interrupted_imitation_is_told_and_goes_on(tmp_path, monkeypatch, capsys):
+    """What was saved stays until the policy is written; where nothing was, nothing is left."""
+    out, row = tmp_path / "base", imitate._checkpoint_row
+    words = ["train", "base", "Door", "--policy", "mlp", "--num-demos", "2", "--out", str(out), "--set", "iterations=30", "eval_every=25",
+             "eval_episodes=0", "batch=8"]
+
+    def until(iteration):
+        def told(now, *others):
+            if now >= iteration:
+                raise KeyboardInterrupt
+            return row(now, *others)
+
+        monkeypatch.setattr(imitate, "_checkpoint_row", told)
+        return cli.main(words)
+
+    assert until(1) == 130 and "Nothing had been saved yet" in capsys.readouterr().err and not list(tmp_path.iterdir())
+    assert until(30) == 130 and "saved up to step 25; go on with: the same command" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["base.training"]
+    assert cli.main([*words, "lr=0.5"]) == 2 and "holds another run (differing: lr)" in capsys.readouterr().err
+    assert until(99) == 0
+    said = capsys.readouterr().out
+    assert "iteration 30" in said and "iteration 10" not in said and [path.name for path in tmp_path.iterdir()] == ["base"]
+    assert cli.main([str(tmp_path / "whole") if word == str(out) else word for word in words]) == 0
+    assert "iteration 10, seconds" in capsys.readouterr().out
+    assert read_card(out)["weights_sha256"] == read_card(tmp_path / "whole")["weights_sha256"]
 
 
 def test_a_task_of_ones_own_takes_one_entry_in_the_registry(monkeypatch, tmp_path, capsys):

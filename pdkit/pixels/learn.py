@@ -19,8 +19,10 @@ from ..demos.format import Demos
 from ..errors import PdkitError
 from ..evaluate import selection_scores
 from ..gradient_steps import GradientSteps, make_optimizer
-from ..imitate import Average, ImitateConfig, Windows, best_checkpoint, imitate
+from ..imitate import Average, ImitateConfig, Saved, Windows, best_checkpoint, imitate
 from ..policies import MLP, POLICIES, BeT, DiffusionPolicy, Policy
+from ..rl.state import pack, unpack
+from ..runs import Run
 from ..tasks import get_task
 from ..tasks.spec import TaskSpec
 from .cameras import View, view_of
@@ -33,8 +35,8 @@ HEADS = ("mlp", "bet", "diffusion")  # trained together with an encoder
 
 def imitate_pixels(kind: str, demos: Demos, pictures: Pictures, config: ImitateConfig, policy_config: dict | None = None, *,
                    shift: int | None = None, device: str = "cpu", progress: Callable[[dict], None] | None = None,
-                   spec: TaskSpec | None = None, view: View | None = None) -> tuple[Policy, Encoder, list[dict]]:
-    """Train an encoder and a policy of `kind` on demonstrations and their pictures.
+                   spec: TaskSpec | None = None, view: View | None = None, run: Run | None = None) -> tuple[Policy, Encoder, list[dict]]:
+    """Train an encoder and a policy of `kind` on demonstrations and their pictures; in `run` as `imitate` does.
 
     `shift` is the random shift in pixels (the view's, if not given); `spec` and `view` are for worlds outside the registry.
     Returns the selected policy and encoder, on the CPU, in evaluation mode and with weights rounded to bfloat16 (as they are shipped),
@@ -75,13 +77,16 @@ def imitate_pixels(kind: str, demos: Demos, pictures: Pictures, config: ImitateC
         features = encoder(*seen.split([rgb.shape[1], depth.shape[1]], dim=1)).unflatten(0, state.shape[:2])
         return policy.loss(torch.cat([state, features.float()], dim=-1), actions, *drawn)
 
-    def candidate() -> tuple[tuple[Policy, Encoder], dict[str, float]]:
-        it = _finished(policy, encoder, demos, pictures)
-        return it, selection_scores(pixel_spec(spec, it[1]), it[0], config.eval_episodes, config.seed)
+    def candidate() -> tuple[dict[str, torch.Tensor], dict[str, float]]:
+        mine, eyes = _finished(policy, encoder, demos, pictures)
+        scores = selection_scores(pixel_spec(spec, eyes), mine, config.eval_episodes, config.seed)
+        return pack({"policy": mine, "encoder": eyes}, {}), scores
 
     step = GradientSteps(loss, optimizer, device, config.bf16)
-    chosen, history = best_checkpoint(config, lambda: step(*batch()), optimizer, average, candidate, progress)
-    return *chosen, history
+    saved = run and Saved(run, {"policy": policy, "encoder": encoder}, optimizer, average, generator)
+    chosen, history = best_checkpoint(config, lambda: step(*batch()), optimizer, average, candidate, progress, saved)
+    unpack(chosen, {"policy": policy.cpu(), "encoder": encoder.cpu()}, {})
+    return policy.eval(), encoder.eval().requires_grad_(False), history
 
 
 def look_up(demos: Demos, pictures: Pictures, encoder: Encoder, config: ImitateConfig, policy_config: dict | None = None, *,

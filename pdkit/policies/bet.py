@@ -5,7 +5,7 @@ position, predicts which bin (focal loss) and the offset for each bin (squared e
 Acting takes the most likely bin's centre plus its offset, at the last position. The kit's numbers are smaller, so that a CPU trains it in
 minutes: a window of 10, 1,500 gradient steps at a rate of 1e-3 on batches of 256, no dropout while it acts; the official code has 20,
 200,000, 1e-4, 2,048, and dropout on (StackCube 1e-3 and 4,096, PegInsertionSide an embedding of 256, PushChair 16 bins), and the best of
-evaluations every 5,000 steps on 100 episodes. `pdkit train base` takes all of these by --set; no profile has them.
+evaluations every 5,000 steps on 100 episodes: `pdkit train base TASK --profile paper`.
 """
 from __future__ import annotations
 

@@ -21,8 +21,8 @@ not yet tell noise from actions well (data/results/sampling.csv).
 With obs_encoder what FiLM sees of the observations goes through layers of their own first; the official code, on states, has none.
 After 4,000 gradient steps one for PegInsertionSide solved 14 of 20 episodes so, without them none (data/RESULTS.md).
 
-The official code trains on batches of 1,024 for a million steps (PushChair 300,000), and tests base policies by DDPM's 100 steps; here the
-numbers are those of imitate.py, unless --set says otherwise, and base policies are chosen and tested by the DDIM that acts online.
+The official code trains on batches of 1,024 for a million steps (PushChair 300,000; `pdkit train base TASK --policy diffusion --profile
+paper`), and tests base policies by DDPM's 100 steps; here they are chosen and tested by the DDIM that acts online.
 
 The sequence begins with the oldest observation of the window, so its first `window - 1` actions lie in the past. The last steps of
 sampling may have a network of their own: what DPPO fine-tunes (pdkit/rl/dppo.py), while the steps before them stay as imitated.

@@ -22,8 +22,12 @@ def unpack(tensors: dict[str, torch.Tensor], modules: dict[str, nn.Module], opti
         module.load_state_dict({k.removeprefix(f"{name}."): v for k, v in tensors.items() if k.startswith(f"{name}.")})
     for name, optimizer in optimizers.items():
         state: dict[int, dict[str, torch.Tensor]] = {}
+        parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
         for key, value in tensors.items():
             if key.startswith(f"{name}."):
                 _, index, slot = key.split(".")
-                state.setdefault(int(index), {})[slot] = value.clone()
+                like = parameters[int(index)]
+                # Numbers lie in memory as the parameter's do (a convolution's may have their channels last): fused kernels rely on it.
+                same = torch.empty_like(like, dtype=value.dtype).copy_(value) if value.shape == like.shape else value.clone()
+                state.setdefault(int(index), {})[slot] = same
         optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})
