@@ -18,7 +18,6 @@ from .pixels.encoders import FEATURES, Encoder
 from .pixels.pictures import Pictures
 from .pixels.sim import Frame, PixelSim
 from .policies import Policy
-from .stats import wilson
 from .tasks import get_task
 from .video import try_render
 
@@ -117,14 +116,6 @@ def errors(policy: Policy, encoder: Encoder, demos: Demos, pictures: Pictures) -
         actions = policy.act(np.concatenate([state, seen], axis=1)[:, None].repeat(policy.window, axis=1))[:, 0]
         results[name] = float(np.sqrt(np.mean((actions - demos.actions) ** 2)))
     return results
-
-
-def verdict(row: pd.Series) -> str:
-    """Whether a visual policy was improved (Fig. 8), judged by one recorded row, with the rule made beforehand: "partly" if Wilson's 95 %
-    interval of the decorated success lies above the base's success, "not" otherwise. Never "reproduced", as one run is no test.
-    """
-    rate = wilson(round(row.decorated_success * row.episodes), int(row.episodes))
-    return "partly" if rate.low > row.base_success else "not"
 
 
 def probe(encoder: Encoder, demos: Demos, pictures: Pictures, numbers: slice, train: int) -> float:

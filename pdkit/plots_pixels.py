@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from .pixels.cameras import view_of
 from .pixels.sim import Frame
 from .plots import COLORS, Picture, _percent, blank, styled
+from .plots_compare import nth
 
 
 def _bare(ax: Axes, title: str = "") -> None:
@@ -89,16 +90,19 @@ def memory_figure(table: pd.DataFrame, steps: int) -> Picture:
 
 @styled
 def training_figure(curves: pd.DataFrame, labels: Mapping[str, str], *, base: float | None = None, title: str = "") -> Picture:
-    """Solved training episodes between logged steps, a line a recipe of `labels`, and evaluations as squares; dashed, the visual base.
+    """Solved training episodes between logged steps, a line a recipe of `labels` (the mean over its seeds), and evaluations as squares;
+    dashed, the visual base.
 
-    `curves` has recipe, step, train_success and, where it was evaluated, success_once.
+    `curves` has recipe, seed, step, train_success and, where it was evaluated, success_once.
     """
     figure, axes = blank(size=(7.2, 3.4))
     ax = axes[0, 0]
     for recipe, colour in zip(labels, (COLORS["gate"], COLORS["decorated"], COLORS["lost"]), strict=False):
-        rows = curves[curves.recipe == recipe].sort_values("step")
+        mine = curves[curves.recipe == recipe]
+        seeds = mine.seed.nunique()
+        rows = nth(mine)[[name for name in ("step", "train_success", "success_once") if name in mine]].mean()
         known = rows.dropna(subset=["train_success"])
-        ax.plot(known.step, known.train_success, "-o", ms=3.5, color=colour, label=labels[recipe])
+        ax.plot(known.step, known.train_success, "-o", ms=3.5, color=colour, label=labels[recipe] + f", {seeds} seeds" * (seeds > 1))
         if "success_once" in rows:
             ax.plot(rows.step, rows.success_once, "s", ms=7, mfc="none", color=colour)
     ax.plot([], [], "s", ms=7, mfc="none", color="0.3", label="evaluation, to the test's time limit")

@@ -676,12 +676,6 @@ def test_blindfolded_the_features_stand_still(sighted):
     np.testing.assert_allclose(pixel_analysis.blindfolded(policy, REACH)(states), policy.act(expected), atol=1e-4)
 
 
-def test_the_verdict_is_partly_at_most():
-    row = dict(episodes=40, base_success=0.375)
-    assert pixel_analysis.verdict(pd.Series(row | {"decorated_success": 0.975})) == "partly"
-    assert pixel_analysis.verdict(pd.Series(row | {"decorated_success": 0.45})) == "not"  # its interval reaches below the base
-
-
 def test_the_exercise(capsys):
     assert check.shift(pixel_analysis.shifted)
     wrong = {lambda p, d, r: np.roll(p, (d, r), (0, 1)): "np.roll", lambda p, d, r: pixel_analysis.shifted(p, -d, -r): "other way",
@@ -696,9 +690,12 @@ def test_figures_of_views_and_shifts():
     assert plots_pixels.views_figure(frames).png()
     picture = np.zeros((8, 8, 3), np.uint8)
     assert plots_pixels.shift_figure(picture, [picture, picture], 2).png()
-    curves = pd.DataFrame({"recipe": "a", "step": [10, 20], "train_success": [0.5, np.nan], "success_once": [np.nan, 1.0]})
+    curves = pd.DataFrame({"recipe": "a", "seed": [0, 0, 1, 1], "step": [10, 20, 12, 20], "train_success": [0.5, np.nan, 0.7, np.nan],
+                           "success_once": [np.nan, 1.0, np.nan, 0.9]})
     figure = plots_pixels.training_figure(curves, {"a": "A", "b": "none"}, base=0.4)
-    assert figure.png() and list(figure.axes[0].lines[0].get_xdata()) == [10]
+    line, squares = figure.axes[0].lines[:2]
+    assert figure.png() and line.get_xydata().tolist() == [[11, 0.6]] and line.get_label() == "A, 2 seeds"  # the mean of both
+    assert squares.get_xydata()[-1].tolist() == [20, 0.95]
 
 
 # ---- what is refused before anything is drawn -----------------------------------------------------------------------
