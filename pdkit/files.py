@@ -90,6 +90,15 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
         shutil.rmtree(old, ignore_errors=True)
 
 
+def discard(path: str | Path) -> None:
+    """Remove a folder, so that no reader sees a part of it."""
+    path = Path(os.path.realpath(path))
+    gone = path.with_name(f"{path.name}{TEMPORARY}{os.getpid()}")
+    with contextlib.suppress(FileNotFoundError):
+        os.replace(path, gone)
+    shutil.rmtree(gone, ignore_errors=True)
+
+
 def check_replaceable(path: str | Path, *names: str) -> None:
     """Raises PdkitError for a folder that holds something, but none of the files `names`, by which it would be known as one of ours."""
     path = Path(os.path.realpath(path))

@@ -132,6 +132,10 @@ class Windows:
         return self.observations[start + self.span], self.actions[start + self.ahead]
 
 
+class Diverged(PdkitError):
+    """The loss is no number any more: going on from a checkpoint would repeat it."""
+
+
 class Average:
     """The exponentially averaged weights of what is in training (diffusers' EMAModel, whose decay rises with the steps); with a power of 0
     there is no average, and the weights are always those of training."""
@@ -179,11 +183,11 @@ class Average:
             self._ema.optimization_step = int(tensors["average.steps"])
 
 
-def _checkpoint_row(iteration: int, started: float, terms: dict[str, torch.Tensor], lr: float) -> dict[str, float]:
-    """iteration, seconds since `started` and the loss terms. Raises PdkitError for a loss that is no number."""
-    row = {"iteration": iteration, "seconds": time.monotonic() - started, **{k: float(v.detach()) for k, v in terms.items()}}
+def _checkpoint_row(iteration: int, terms: dict[str, torch.Tensor], lr: float) -> dict[str, float]:
+    """iteration and the loss terms. Raises Diverged for a loss that is no number."""
+    row = {"iteration": iteration, **{k: float(v.detach()) for k, v in terms.items()}}
     if not np.isfinite(row["loss"]):
-        raise PdkitError(f"The imitation loss became {row['loss']} at iteration {iteration}; lower lr (now {lr}).")
+        raise Diverged(f"The imitation loss became {row['loss']} at iteration {iteration}; lower lr (now {lr}).")
     return row
 
 
@@ -191,7 +195,7 @@ def imitate(kind: str, demos: Demos, config: ImitateConfig | None = None, policy
             progress: Callable[[dict], None] | None = None, spec: TaskSpec | None = None, run: Run | None = None
             ) -> tuple[Policy, list[dict]]:
     """Train a policy of `kind` on `demos`; `spec` is for worlds outside the registry, such as the probes. With a `run` the training is
-    saved there at each checkpoint and goes on from there, to the same numbers (on a GPU dropout draws others).
+    saved there at each checkpoint and goes on from there, to the same numbers.
 
     Returns the selected policy in evaluation mode, on `device`, and one row per checkpoint: iteration, loss terms, seconds and, when
     evaluated, success_once and success_at_end on the selection seeds. A policy without gradient steps, such as VINN, is only
@@ -237,7 +241,7 @@ class Saved:
 
     Args:
         networks: what is trained, by name; its optimizer and average.
-        batches: the generator that draws the batches. All else is drawn by torch's own, on the CPU.
+        batches: the generator that draws the batches. All else is drawn by torch's own.
     """
 
     def __init__(self, run: Run, networks: dict[str, nn.Module], optimizer: torch.optim.Optimizer, average: Average,
@@ -248,6 +252,8 @@ class Saved:
         """Write it; `chosen` is the best candidate so far, and `best` its score."""
         tensors = pack(*self._parts) | self._average.pack() | {f"chosen.{name}": value for name, value in chosen.items()}
         tensors |= {"batches": self._batches.get_state(), "torch": torch.get_rng_state()}
+        if torch.cuda.is_available():
+            tensors["cuda"] = torch.cuda.get_rng_state()
         arrays = {name: value.detach().cpu().numpy() for name, value in tensors.items()}
         self._run.save_checkpoint(arrays, {"step": history[-1]["iteration"], "history": history, "best": best})
 
@@ -261,6 +267,8 @@ class Saved:
         self._average.unpack(tensors)
         self._batches.set_state(tensors["batches"])
         torch.set_rng_state(tensors["torch"])
+        if "cuda" in tensors and torch.cuda.is_available():
+            torch.cuda.set_rng_state(tensors["cuda"])
         chosen = {name.removeprefix("chosen."): value for name, value in tensors.items() if name.startswith("chosen.")}
         return values["history"], values["best"], chosen
 
@@ -270,8 +278,8 @@ def best_checkpoint(config: ImitateConfig, step: Callable[[], dict[str, torch.Te
                     saved: Saved | None = None) -> tuple[dict[str, torch.Tensor], list[dict]]:
     """Make `config.iterations` gradient steps; the best candidate by its success_once (without evaluations the latest), and one row
     a checkpoint. `step` makes a gradient step and gives its loss terms; `candidate` gives what may be chosen, and its scores, and is
-    called while the weights are the averaged ones. What was `saved` is not done again. `progress` is given each row, and before the first
-    one what EARLY steps took. Raises PdkitError for a loss that is no number.
+    called while the weights are the averaged ones. What was `saved` is not done again. `progress` is given each row and, where the next
+    is further than EARLY steps away, after these a dict of iteration and seconds_a_step. Raises Diverged for a loss that is no number.
     """
     history, best, chosen = saved.load() if saved else ([], -1.0, {})
     done, started = (history[-1]["iteration"], time.monotonic() - history[-1]["seconds"]) if history else (0, time.monotonic())
@@ -283,14 +291,17 @@ def best_checkpoint(config: ImitateConfig, step: Callable[[], dict[str, torch.Te
         terms = step()
         rates.step()
         average.step()
+        if iteration == done + 1:
+            began = time.monotonic()  # the first step takes longer
         if iteration % config.eval_every and iteration < config.iterations:
-            if progress and iteration == EARLY:
-                progress({"iteration": iteration, "seconds": time.monotonic() - started})
+            if progress and iteration == done + EARLY:
+                float(terms["loss"])  # a GPU may not be there yet
+                progress({"iteration": iteration, "seconds_a_step": (time.monotonic() - began) / (EARLY - 1)})
             continue
-        row = _checkpoint_row(iteration, started, terms, config.lr)
+        row = _checkpoint_row(iteration, terms, config.lr)
         with average.in_place():
             it, scores = candidate()
-        row |= scores
+        row |= {"seconds": time.monotonic() - started} | scores
         score = scores.get("success_once", float(iteration))
         if score > best:
             best, chosen = score, it

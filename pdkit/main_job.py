@@ -49,6 +49,8 @@ def duration(minutes: float) -> str:
     """`minutes` in words, as exact as an estimate deserves."""
     if minutes < 1:
         return "less than a minute"
+    if minutes < 1.5:
+        return "about a minute"
     return f"about {minutes:.0f} minutes" if minutes < 90 else f"about {minutes / 60:.0f} hours"
 
 

@@ -78,6 +78,8 @@ class Run:
         if self.manifest_path.exists():
             self.manifest = read_json(self.manifest_path)
             self._must_match(kind, parameters)
+        elif self.has_checkpoint:
+            raise PdkitError(f"{self.folder} holds a checkpoint without the manifest.json that would tell of what; delete that folder.")
         else:
             self.manifest = {"kind": kind, "parameters": parameters, "started": _now(), "finished": None, "machine": describe_machine()}
             self._write_manifest()

@@ -57,7 +57,8 @@ def _alone(name: str) -> Iterator[None]:
 
 
 def _listing(job: Job) -> str:
-    state = "to do" if job.out else "finished" if finished(job) else "interrupted" if (job.folder / "run").exists() else "to do"
+    begun = [ROOT / f"{job.out}.training"] if job.out else [job.folder / "run", job.folder / "run.training"]
+    state = "finished" if not job.out and finished(job) else "interrupted" if any(path.exists() for path in begun) else "to do"
     return f"{state:11}  {'' if job.minutes is None else f'{job.minutes:4.1f} min'}  {job.command}"
 
 

@@ -1,9 +1,8 @@
 """Running many jobs side by side: what one job loses, the others keep.
 
 A job is a `pdkit` command in a folder of its own. It is finished when its result.json is there, which is written atomically
-and last; so a second go skips what is finished, and what was interrupted resumes from its own checkpoint (imitation, which takes
-minutes, begins anew). The same job function runs in processes of this machine (`Local`) or on Ray (pdkit/sweep_ray.py). Nothing heavy
-is imported here: every worker does.
+and last; so a second go skips what is finished, and what was interrupted resumes from its own checkpoint. The same job function runs
+in processes of this machine (`Local`) or on Ray (pdkit/sweep_ray.py). Nothing heavy is imported here: every worker does.
 """
 from __future__ import annotations
 
@@ -108,11 +107,13 @@ def _trained(job: Job, out: Path) -> dict[str, Any]:
 
 
 def _imitated(job: Job, out: Path) -> dict[str, Any]:
+    from .runs import commits
+
     card = read_json(out / "policy.json")
     info = card["info"]
     row = {"policy": card["kind"], "demos": info["demos"], "train_minutes": round(info["seconds"] / 60, 2),
            "cores": info["machine"]["cores"], "device": info["device"], "iteration": info["selected"]["iteration"],
-           "commit": info["machine"]["git"], **info["test"]}
+           "commit": commits(info), **info["test"]}
     return {"row": row, "curve": [], "settings": base_settings(card)}
 
 

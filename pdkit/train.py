@@ -7,7 +7,6 @@ import hashlib
 import json
 import math
 import shlex
-import shutil
 import sys
 from collections.abc import Iterator
 from dataclasses import asdict, fields
@@ -22,8 +21,8 @@ from .demos import Demos, sources
 from .demos.cli import Progress
 from .errors import PdkitError
 from .evaluate import evaluate
-from .files import DATA, atomic_file, atomic_folder, check_replaceable, code_checksum, read_json, runs_root, write_json
-from .imitate import configured, imitate
+from .files import DATA, atomic_file, atomic_folder, check_replaceable, code_checksum, discard, locked, read_json, runs_root, write_json
+from .imitate import Diverged, configured, imitate
 from .machine import load_average
 from .main_job import duration
 from .methods import METHODS
@@ -120,14 +119,21 @@ def _base(args) -> int:
         raise PdkitError(f"There is no encoder in {eyes}; name the folder of a policy trained by `pdkit train base {args.task} --pixels`.")
     config, architecture = configured(args.policy, settings)
     device = pick_device(args.device) if POLICIES[args.policy].learns else "cpu"
-    out = Path(args.out) if args.out else runs_root() / "base" / f"{args.task}-{args.policy}{'-pixels' if args.pixels else ''}"
+    out = Path(args.out).resolve() if args.out else runs_root() / "base" / f"{args.task}-{args.policy}{'-pixels' if args.pixels else ''}"
     check_replaceable(out, "policy.json")  # before the work, not after
+    folder = out.with_name(f"{out.name}.training")
+    check_replaceable(folder, "manifest.json")
     print(f"{args.policy} on {demos.num} demonstrations of {args.task} ({demos.label}), on {device}: {config}", flush=True)
 
     def show(row: dict[str, float]) -> None:
-        left = row["seconds"] / max(1, row["iteration"]) * (config.iterations - row["iteration"]) if row["iteration"] else 0.0
-        text = ", ".join(f"{k} {v:,}" if k == "iteration" else f"{k} {v:.3g}" for k, v in row.items())
-        print(f"  {text}" + (f"; {duration(left / 60)} left" if left else ""), flush=True)
+        to_do = config.iterations - row["iteration"]
+        if "seconds_a_step" in row:
+            left = duration(to_do * row["seconds_a_step"] / 60)
+            print(f"  {row['seconds_a_step']:.2g} seconds a gradient step: {left} left, evaluations aside", flush=True)
+            return
+        text = ", ".join(f"{k} {v:,.0f}" if k in ("iteration", "seconds") else f"{k} {v:.3g}" for k, v in row.items())
+        left = f"; {duration(row['seconds'] / row['iteration'] * to_do / 60)} left" if row["iteration"] and to_do else ""
+        print(f"  {text}{left}", flush=True)
 
     pictures = None
     if args.pixels:
@@ -136,9 +142,10 @@ def _base(args) -> int:
         if encoder:
             pixel_spec(get_task(args.task), encoder)
         pictures = pictures_of(demos, Progress(demos.num, "drawn"))
-    folder = out.with_name(f"{out.name}.training")
+    what = {"policy": args.policy, "task": demos.task, "demos": demos.checksum, "num_demos": demos.num, "pixels": args.pixels,
+            "random_shift": shift, "encoder": encoder.checksum if encoder else None} | asdict(config) | architecture
     try:
-        with _training(folder, args.policy, demos, asdict(config) | architecture | ({"random_shift": shift} if pictures else {})) as run:
+        with _training(folder, what) as run:
             if encoder:
                 policy, history = look_up(demos, pictures, encoder, config, architecture, progress=show)
             elif pictures:
@@ -146,37 +153,47 @@ def _base(args) -> int:
                                                           progress=show, run=run)
             else:
                 policy, history = imitate(args.policy, demos, config, architecture, device=device, progress=show, run=run)
+            best = max(history, key=lambda row: row.get("success_once", row["iteration"]))
+            info = {"task": args.task, "demos": demos.num, "demos_checksum": demos.checksum, "label": demos.label,
+                    "imitate": asdict(config), "selected": best, "seconds": history[-1]["seconds"],
+                    "command": shlex.join(["pdkit", "train", *sys.argv[2:]]), "device": device} | {
+                name: run.manifest[name] for name in ("machine", "resumed") if name in run.manifest}
+            if args.pixels:
+                save_visual(policy, encoder, out, info)
+            else:
+                save_policy(policy, out, info)
+            print(f"wrote {out}", flush=True)
+            if args.episodes:  # after the policy is safe
+                spec = pixel_spec(get_task(args.task), encoder) if encoder else get_task(args.task)
+                test = {"episodes": args.episodes} | _outcome("base", _episodes(load_policy(out), spec, args.episodes, config.seed))
+                write_json(out / "policy.json", read_card(out) | {"info": info | {"test": test}})
+                print("  " + ", ".join(f"{k} {v}" for k, v in test.items()), flush=True)
+            discard(folder)
     except KeyboardInterrupt:
         print(f"\nInterrupted. {kept_so_far(folder)} the same command.", file=sys.stderr)
         return 130
-    best = max(history, key=lambda row: row.get("success_once", row["iteration"]))
-    info = {"task": args.task, "demos": demos.num, "demos_checksum": demos.checksum, "label": demos.label, "imitate": asdict(config),
-            "selected": best, "seconds": history[-1]["seconds"], "command": shlex.join(["pdkit", "train", *sys.argv[2:]]), "device": device,
-            "machine": describe_machine()}
-    if args.pixels:
-        save_visual(policy, encoder, out, info)
-    else:
-        save_policy(policy, out, info)
-    shutil.rmtree(folder, ignore_errors=True)
-    print(f"wrote {out}", flush=True)
-    if args.episodes:  # after the policy is safe
-        spec = pixel_spec(get_task(args.task), encoder) if encoder else get_task(args.task)
-        test = {"episodes": args.episodes} | _outcome("base", _episodes(load_policy(out), spec, args.episodes, config.seed))
-        write_json(out / "policy.json", read_card(out) | {"info": info | {"test": test}})
-        print("  " + ", ".join(f"{k} {v}" for k, v in test.items()), flush=True)
     return 0
 
 
 @contextlib.contextmanager
-def _training(folder: Path, kind: str, demos: Demos, settings: dict[str, Any]) -> Iterator[Run]:
-    """The run of an imitation that is not done: its folder stays if there is anything to go on from."""
-    run = Run(folder, "base", {"policy": kind, "task": demos.task, "demos": demos.checksum, "num_demos": demos.num} | settings)
-    try:
-        with run.alone():
+def _training(folder: Path, what: dict[str, Any]) -> Iterator[Run]:
+    """The run of an imitation that is not done: its folder stays if there is anything to go on from. Raises PdkitError where another
+    process works in it, or where it holds a training of something else."""
+    if folder.exists() and not (folder / "checkpoint" / "state.json").exists():  # a killed process left nothing else
+        with locked(folder / "lock", f"Another process is at work in {folder}; wait for it, or choose another folder."):
+            discard(folder)
+    run = Run(folder, "base", what)
+    with run.alone():
+        if run.has_checkpoint:
+            print(kept_so_far(folder).partition(";")[0] + "; it goes on from there.", flush=True)
+        try:
             yield run
-    finally:
-        if not run.has_checkpoint:
-            shutil.rmtree(folder, ignore_errors=True)
+        except Diverged:
+            discard(folder)
+            raise
+        finally:
+            if not run.has_checkpoint:
+                discard(folder)
 
 
 def _decorated(args) -> int:

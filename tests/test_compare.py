@@ -335,6 +335,17 @@ def test_the_trade_draws_runs_means_and_starts(table):
         plots_compare.trade_figure(table.assign(decorated_jerk=np.nan))
 
 
+def test_curves_that_coincide_are_both_seen_and_begin_at_their_starts():
+    curves = pd.DataFrame({"recipe": ["a", "a", "b", "b", "c", "c"], "seed": 0, "step": 3 * [10, 20], "success_once": [0, 0, 0, 0, 0, 0.5]})
+    ax = plots_compare.curves_figure(curves, starts={"b": 0.4}).axes[0]
+    assert [line.get_linestyle() for line in ax.lines if len(line.get_xdata()) == 2] == ["-", "--", "-"]
+    assert [line.get_xydata().tolist() for line in ax.lines if line.get_marker() == "s"] == [[[0, 0.4]]]
+    panels = plots_compare.panels_figure(curves, {"one": ["a", "b", "c"]}, starts={"a": 0.5, "b": 0.5}).axes[0]
+    assert [line.get_linestyle() for line in panels.lines if len(line.get_xdata()) == 2] == ["-", "--", "-"]
+    sizes = [line.get_markersize() for line in panels.lines if line.get_marker() == "s"]
+    assert len(sizes) == 2 and sizes[0] > sizes[1]  # a square in the other
+
+
 def test_starting_points_are_those_of_methods_that_start_from_a_policy(table):
     """One cross for a policy that several share, one for each of two lookups, and none for the yardstick of a method from scratch."""
     table = pd.concat([table.assign(base_jerk=[50.0, 50.1, 49.9] * 2 + [9.0] * 3), runs("fish", [0.9], policy="vinn", base=0.93),

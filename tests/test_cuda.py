@@ -66,6 +66,26 @@ def test_imitation_on_the_gpu_learns_the_probe_and_its_checkpoint_loads_on_the_c
     np.testing.assert_allclose(loaded.act(windows), policy.act(windows), atol=1e-5)
 
 
+@pytest.mark.parametrize("kind", ["bet", "diffusion"])
+def test_an_interrupted_imitation_goes_on_as_one_that_was_not(kind, tmp_path):
+    """With recorded steps, a rate that falls, dropout or an average, and the GPU's own random numbers."""
+    settings = dict(iterations=12, batch=16, eval_every=6, eval_episodes=0, schedule="cosine", bf16=False)
+    config = ImitateConfig(**POLICIES[kind].recipe | settings)
+
+    def interrupt(row):
+        if row["iteration"] == 6:
+            raise KeyboardInterrupt
+
+    def train(run=None, progress=None):
+        return imitate(kind, reach_demos(4), config, SMALL[kind], device="cuda", spec=PROBES["reach"], run=run, progress=progress)[1]
+
+    whole = train()
+    with pytest.raises(KeyboardInterrupt):
+        train(Run(tmp_path, "base", {}), interrupt)
+    again = train(Run(tmp_path, "base", {}))
+    assert [row["loss"] for row in again] == pytest.approx([row["loss"] for row in whole], rel=1e-3)
+
+
 def test_what_checkpoints_draw_does_not_change_the_training():
     """Dropout draws from the GPU's generator, which acting seeds."""
     last = [imitate("bet", reach_demos(4), ImitateConfig(iterations=6, batch=16, eval_every=every, eval_episodes=1, bf16=False),

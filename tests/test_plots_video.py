@@ -191,6 +191,13 @@ def test_never_solved(clip):
     assert (failed.first_success, failed.outcome, failed.solved_by(99)) == (None, "not solved", False)
 
 
+def test_a_sheet_shows_each_episode_at_steps_of_its_own_where_lengths_differ(clip):
+    frames = [clip.frames[0]] * 21
+    long, short = (video.Clip("Counter", 1, np.zeros(steps, bool), frames[: steps + 1], list(range(steps + 1))) for steps in (20, 4))
+    alike, own = ([ax.texts[0].get_text() for ax in video.contact_sheet([long, short], columns=3, alike=same).axes] for same in (True, False))
+    assert alike == ["0", "10", "20", "0", "4", "4"] and own == ["0", "10", "20", "0", "2", "4"]
+
+
 def test_contact_sheet_marks_success(clip):
     figure = video.contact_sheet([clip, clip], columns=4, labels=["base", "decorated"])
     axes = np.array(figure.axes).reshape(2, 4)

@@ -266,7 +266,9 @@ def test_an_interrupted_imitation_goes_on_to_the_same_policy(kind, tiny, scores,
     steps.clear()
     again, rows = train(scores[2:], Run(tmp_path, "base", {}))
     assert len(steps) == 6 and [row["success_once"] for row in rows] == list(scores)
-    assert [row["loss"] for row in rows] == [row["loss"] for row in history] and rows[-1]["seconds"] > rows[0]["seconds"]
+    assert [row["loss"] for row in rows] == [row["loss"] for row in history]
+    seconds = [row["seconds"] for row in rows]
+    assert seconds == sorted(set(seconds))  # the clock goes on, too
     assert all(torch.equal(value, whole.state_dict()[name]) for name, value in again.state_dict().items())
 
 

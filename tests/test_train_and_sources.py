@@ -1,5 +1,6 @@
 """`pdkit train`, `pdkit demos` and the sources of demonstrations."""
 import shlex
+import shutil
 import sys
 from dataclasses import replace
 from types import SimpleNamespace
@@ -17,8 +18,9 @@ from pdkit import cli, imitate, report, train
 from pdkit.decorated import load_decorated
 from pdkit.demos import load_demos, save_demos
 from pdkit.errors import PdkitError
-from pdkit.files import DATA
-from pdkit.policies import BeT, load_policy
+from pdkit.files import DATA, locked
+from pdkit.imitate import Saved
+from pdkit.policies import POLICIES, BeT, load_policy
 from pdkit.policies.base import read_card
 from pdkit.policies.diffusion import DiffusionPolicy
 from pdkit.probes import PROBES, ProbeBase
@@ -321,10 +323,63 @@ def test_an_interrupted_imitation_is_told_and_goes_on(tmp_path, monkeypatch, cap
     assert cli.main([*words, "lr=0.5"]) == 2 and "holds another run (differing: lr)" in capsys.readouterr().err
     assert until(99) == 0
     said = capsys.readouterr().out
-    assert "iteration 30" in said and "iteration 10" not in said and [path.name for path in tmp_path.iterdir()] == ["base"]
+    assert "saved up to step 25; it goes on from there" in said and "iteration 30" in said
+    assert [path.name for path in tmp_path.iterdir()] == ["base"]
     assert cli.main([str(tmp_path / "whole") if word == str(out) else word for word in words]) == 0
-    assert "iteration 10, seconds" in capsys.readouterr().out
+    assert "seconds a gradient step: less than a minute left" in capsys.readouterr().out
     assert read_card(out)["weights_sha256"] == read_card(tmp_path / "whole")["weights_sha256"]
+
+
+def _words(out, *settings, num=2):
+    return ["train", "base", "Door", "--policy", "mlp", "--num-demos", str(num), "--out", str(out), "--set", "iterations=4", "eval_every=2",
+            "eval_episodes=0", "batch=8", *settings]
+
+
+def test_a_training_of_imitation_is_gone_on_with_by_the_same_command_alone(tmp_path, monkeypatch, capsys):
+    """Not with other demonstrations, nor from pictures, nor while another process is at it; and what lies beside is nobody's to remove."""
+    saves, folder = Saved.save, tmp_path / "base.training"
+
+    def interrupt(self, *what):
+        saves(self, *what)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Saved, "save", interrupt)
+    monkeypatch.setattr(train, "pictures_of", lambda *_: object())
+    assert cli.main(_words(tmp_path / "base")) == 130
+    monkeypatch.undo()
+    monkeypatch.setattr(train, "pictures_of", lambda *_: object())
+    for words, said in ((_words(tmp_path / "base", num=3), "(differing: demos, num_demos)"),
+                        ([*_words(tmp_path / "base"), "--pixels"], "(differing: pixels)")):
+        capsys.readouterr()
+        assert cli.main(words) == 2 and said in capsys.readouterr().err
+    with locked(folder / "lock", ""):
+        assert cli.main(_words(tmp_path / "base")) == 2 and "Another process is at work" in capsys.readouterr().err
+        shutil.rmtree(folder / "checkpoint")
+        assert cli.main(_words(tmp_path / "base")) == 2 and "Another process is at work" in capsys.readouterr().err
+    assert (folder / "manifest.json").exists()
+    assert cli.main(_words(tmp_path / "base", "lr=0.01")) == 0  # what a killed process left, and nothing to go on from
+    (tmp_path / "mine.training").mkdir()
+    (tmp_path / "mine.training" / "notes.txt").touch()
+    assert cli.main(_words(tmp_path / "mine")) == 2 and "holds something else" in capsys.readouterr().err
+    assert (tmp_path / "mine.training" / "notes.txt").exists() and not (tmp_path / "mine").exists()
+
+
+def test_an_imitation_is_not_repeated_for_its_test_nor_after_a_loss_that_is_no_number(tmp_path, monkeypatch, capsys):
+    words = [*_words(tmp_path / "base"), "--episodes", "1"]
+
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(train, "_episodes", interrupt)
+    assert cli.main(words) == 130 and (tmp_path / "base" / "policy.json").exists()
+    monkeypatch.undo()
+    monkeypatch.setattr(POLICIES["mlp"], "loss", interrupt)
+    assert cli.main(words) == 0 and read_card(tmp_path / "base")["info"]["test"]["episodes"] == 1
+    monkeypatch.undo()
+    assert [path.name for path in tmp_path.iterdir()] == ["base"]
+    capsys.readouterr()
+    assert cli.main(_words(tmp_path / "wild", "lr=1e30", "eval_every=1")) == 2 and "lower lr" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["base"]
 
 
 def test_a_task_of_ones_own_takes_one_entry_in_the_registry(monkeypatch, tmp_path, capsys):

@@ -7,7 +7,7 @@ import torch
 from test_vector import COUNT
 from worlds import clone, reach_demos
 
-from pdkit import plots_failures, unlearning
+from pdkit import plots, plots_failures, unlearning
 from pdkit.decorated import Decorated
 from pdkit.demos import load_demos
 from pdkit.errors import PdkitError
@@ -196,6 +196,16 @@ def test_the_verdict_on_unlearning_follows_the_episodes(few, many, guarded, expe
     verdict, reasons = unlearning.unlearning_verdict(*(comparison(38, k) for k in (few, many, guarded)))
     assert verdict == expected and len(reasons) == 3
     assert [reason.endswith("it falls") for reason in reasons[:2]] == [few < 35, many < 35]
+
+
+def test_a_policy_that_solves_nothing_has_nothing_to_lose():
+    assert unlearning.unlearning_verdict(*3 * [comparison(0, 0)])[0] == "untested"
+
+
+def test_arms_have_the_colour_that_their_name_begins_with():
+    colors = plots_failures.arm_colors(["random critic, 100", "decorated, no entropy, 200", "decorated, 200", "before"])
+    assert list(colors.values()) == [plots_failures.ARMS["random critic"], plots_failures.ARMS["decorated, no entropy"],
+                                     plots_failures.ARMS["decorated"], plots.COLORS["base"]]
 
 
 def test_a_decorated_policy_that_falls_too_is_said_to():
