@@ -194,7 +194,8 @@ def test_never_solved(clip):
 def test_a_sheet_shows_each_episode_at_steps_of_its_own_where_lengths_differ(clip):
     frames = [clip.frames[0]] * 21
     long, short = (video.Clip("Counter", 1, np.zeros(steps, bool), frames[: steps + 1], list(range(steps + 1))) for steps in (20, 4))
-    alike, own = ([ax.texts[0].get_text() for ax in video.contact_sheet([long, short], columns=3, alike=same).axes] for same in (True, False))
+    alike, own = ([ax.texts[0].get_text() for ax in video.contact_sheet([long, short], columns=3, alike=same).axes]
+                  for same in (True, False))
     assert alike == ["0", "10", "20", "0", "4", "4"] and own == ["0", "10", "20", "0", "2", "4"]
 
 
