@@ -318,5 +318,5 @@ def differences_figure(rows: pd.DataFrame, *, colors: Mapping[str, str] | None =
     ax.set_ylim(-0.6, len(rows) - 0.4)
     ax.grid(axis="y", visible=False)
     ax.set(xlabel=xlabel)
-    ax.set_title(title)
+    figure.suptitle(title, x=0.01, ha="left", weight="bold", fontsize=12)  # of the figure: long names leave the axes little room
     return figure
