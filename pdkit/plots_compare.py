@@ -149,6 +149,13 @@ def thousands(ax: Axes, most: int = 5, integer: bool = False) -> None:
     ax.xaxis.set_major_formatter(mpl.ticker.FuncFormatter(lambda x, _: f"{x:,.0f}"))
 
 
+def _plain(axis: mpl.axis.Axis, subs: Sequence[float]) -> None:
+    """Numbers instead of powers along a logarithmic axis, at these multiples of each power of ten."""
+    axis.set_major_locator(mpl.ticker.LogLocator(subs=subs))
+    axis.set_major_formatter(mpl.ticker.FuncFormatter(lambda value, _: f"{value:,.3g}" if value < 1000 else f"{value:,.0f}"))
+    axis.set_minor_formatter(mpl.ticker.NullFormatter())
+
+
 def _values(ax: Axes, axis: str, column: str, label: str, log: bool) -> None:
     """The axis of the values: percent from 0 to 100 for a success rate, as it comes for all else."""
     if "success" in column and axis == "y":
@@ -162,9 +169,7 @@ def _values(ax: Axes, axis: str, column: str, label: str, log: bool) -> None:
             one = ax.xaxis if axis == "x" else ax.yaxis
             low, high = one.get_view_interval()
             subs = (1, 1.5, 2, 3, 5, 7) if high < 10 * low else (1, 2, 5) if high < 100 * low else (1,)
-            one.set_major_locator(mpl.ticker.LogLocator(subs=subs))
-            one.set_major_formatter(mpl.ticker.FuncFormatter(lambda value, _: f"{value:,.3g}" if value < 1000 else f"{value:,.0f}"))
-            one.set_minor_formatter(mpl.ticker.NullFormatter())
+            _plain(one, subs)
 
 
 # ---- many recipes ----------------------------------------------------------------------------------------------------
@@ -285,9 +290,7 @@ def trade_figure(table: pd.DataFrame, *, x: str = "jerk", y: str = "success", la
         ax.plot(*place, "X", ms=10, color="black", mec="white", zorder=4)
         ax.annotate(f"start: {name}", place, (7, -11), textcoords="offset points", fontsize=8.5)
     ax.set_xscale("log")
-    ax.xaxis.set_major_locator(mpl.ticker.LogLocator(subs=(1, 2, 5)))
-    ax.xaxis.set_major_formatter(mpl.ticker.FuncFormatter(lambda value, _: f"{value:,.3g}" if value < 1000 else f"{value:,.0f}"))
-    ax.xaxis.set_minor_formatter(mpl.ticker.NullFormatter())
+    _plain(ax.xaxis, (1, 2, 5))
     _values(ax, "y", y, "success" if "success" in y else "", False)
     ax.set_xlabel(xlabel or x.replace("_", " "))
     ax.set_title(title)

@@ -14,7 +14,7 @@ from .stats import Rate
 
 ARMS = {"random critic": "#d1495b", "critic alone": "#e0a030", "critic learns": "#3c3c46",
         "decorated, pushed": "#6aaed6", "decorated, no entropy": "#3fa7a0", "decorated": COLORS["decorated"]}
-OTHERS = ("#2c9f6b", "#8f5fb0", "#b07a3c", "#7d7d7d")  # for arms without a colour of their own
+OTHER = "#2c9f6b"  # of an arm without a colour of its own
 
 
 def arm_colors(names: Iterable[str]) -> dict[str, str]:
@@ -63,7 +63,7 @@ def drift_figure(drifts: pd.DataFrame, *, bound: float, distance: float) -> Pict
     ax.axhline(distance, color=COLORS["recorded"], lw=1.4)
     ax.axhline(bound, color=COLORS["decorated"], ls=":", lw=1.2)
     for name, rows in drifts.groupby("arm", sort=False):
-        ax.plot(rows["update"], rows.drift, "-o", ms=3.5, color=ARMS.get(name, OTHERS[0]), label=name)
+        ax.plot(rows["update"], rows.drift, "-o", ms=3.5, color=ARMS.get(name, OTHER), label=name)
     right = drifts["update"].max()
     ax.annotate(f"bound {bound:g}", (right, bound), (-2, 3), textcoords="offset points", ha="right", color=COLORS["decorated"],
                 fontsize=8.5)
@@ -74,7 +74,7 @@ def drift_figure(drifts: pd.DataFrame, *, bound: float, distance: float) -> Pict
     other = axes[0, 1]
     other.axhline(0, color="black", lw=0.8)
     for name, rows in drifts[drifts["update"] > 0].groupby("arm", sort=False):
-        other.plot(rows["update"], rows.heading, "-o", ms=3.5, color=ARMS.get(name, OTHERS[0]))
+        other.plot(rows["update"], rows.heading, "-o", ms=3.5, color=ARMS.get(name, OTHER))
     other.set(xlabel="updates of the actor", ylabel="cosine; 1: straight to the better policy", xlim=(0, right * 1.02), ylim=(-1.05, 1.05))
     other.set_title("Where to")
     figure.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=5, fontsize=9)

@@ -169,7 +169,8 @@ def _() -> Finding:
 def _() -> Finding:
     """Jerkier than its guide (the base policy), as a ratio of mean jerk above 1.1 (the tenth is ours). The same from fine-tuning's start
     is told beside it, and not judged: it was run later."""
-    found, table = _jerk("jsrl", 1.1, 1, "leaderboard", recorded("leaderboard")[0]), recorded("leaderboard")[0]
+    table, _ = recorded("leaderboard")
+    found = _jerk("jsrl", 1.1, 1, "leaderboard", table)
     with contextlib.suppress(TooLittle):
         other = _jerk("jsrl,base=bet-sac", 1.1, 1, "leaderboard", table)
         found = replace(found, measured=f"{found.measured}; not judged: {other.measured} ({other.tasks}), {other.interval}")
