@@ -5,13 +5,14 @@ This module imports only the standard library, so that `pd --help` answers at on
 from __future__ import annotations
 
 import argparse
+import ast
 import os
 import re
 import sys
 from collections.abc import Callable
 from importlib import import_module
 from importlib.util import find_spec
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from . import __version__
 from .errors import PdkitError, unknown
@@ -38,6 +39,20 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         raise PdkitError(f"{self.prog}: {message}; `{self.prog} --help` lists what it takes.")
+
+
+def parse_settings(settings: list[str], option: str = "--set") -> dict[str, Any]:
+    """NAME=VALUE strings as a dict, values read as Python literals (bare words as strings). Raises PdkitError, which names `option`."""
+    values = {}
+    for item in settings:
+        name, equals, text = item.partition("=")
+        if not equals or not name:
+            raise PdkitError(f"{option} takes NAME=VALUE, not {item!r}.")
+        try:
+            values[name] = ast.literal_eval(text)
+        except (ValueError, SyntaxError):
+            values[name] = text
+    return values
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -37,7 +37,7 @@ from .runs import Run, origin
 from .stats import Interval, iqm, probability_of_improvement
 from .tasks import get_task
 from .tasks.partnet import object_set
-from .train import decorate
+from .train_decorated import decorate
 from .transfer import load_any
 
 SCRATCH, OTHERS = "from scratch", "others"

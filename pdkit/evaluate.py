@@ -1,6 +1,7 @@
 """Seeded evaluation: every seed runs one whole episode, one row each, so that two policies compare seed by seed."""
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -8,7 +9,7 @@ import numpy as np
 import pandas as pd
 
 from .errors import PdkitError
-from .seeds import own_random_numbers, selection_seeds
+from .seeds import own_random_numbers, reported_seeds, selection_seeds
 from .smoothness import Motions
 from .tasks.lanes import IDLE
 from .tasks.spec import TaskSpec
@@ -72,3 +73,18 @@ def selection_scores(spec: TaskSpec, policy: Any, episodes: int, seed: int, num_
         policy.reset(seed)
         table = evaluate(spec, policy.act, selection_seeds(episodes), window=policy.window, chunk=policy.chunk, num_envs=num_envs)
     return {"success_once": float(table.success_once.mean()), "success_at_end": float(table.success_at_end.mean())}
+
+
+def reported(policy: Any, spec: TaskSpec, episodes: int, draw: int) -> pd.DataFrame:
+    """`evaluate` on the first so many test seeds. A policy that samples acts on random numbers of its own in each run (`draw`): with the
+    same ones in all, a base policy's luck with them would look like what every run lost or gained."""
+    policy.reset(draw)
+    return evaluate(spec, policy.act, reported_seeds(episodes), window=policy.window, chunk=policy.chunk, num_envs=50)
+
+
+def outcome(name: str, table: pd.DataFrame) -> dict[str, float | None]:
+    """Means over the test episodes, as columns of the row."""
+    means = table[["success_once", "success_at_end", "action_change", "jerk"]].mean()
+    jerk = None if math.isnan(means.jerk) else round(means.jerk, 1)
+    return {f"{name}_success": round(means.success_once, 4), f"{name}_success_at_end": round(means.success_at_end, 4),
+            f"{name}_action_change": round(means.action_change, 4), f"{name}_jerk": jerk}

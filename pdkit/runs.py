@@ -5,7 +5,7 @@ import platform
 import subprocess
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
@@ -68,6 +68,11 @@ def commits(manifest: dict[str, Any]) -> str:
     return " then ".join(dict.fromkeys(machine["git"] for machine in machines(manifest)))
 
 
+def only_here(folder: Path) -> AbstractContextManager[None]:
+    """Within this block no other process works in this folder. Raises PdkitError where one does."""
+    return locked(folder / "lock", f"Another process is at work in {folder}; wait for it, or choose another folder.")
+
+
 class Run:
     """One run folder. Opening an existing one with the same parameters resumes it; with other parameters is an error."""
 
@@ -103,7 +108,7 @@ class Run:
 
         Where an unfinished run goes on with other code or on another machine, its manifest says so (`resumed`).
         """
-        with locked(self.folder / "lock", f"Another process is at work in {self.folder}; wait for it, or choose another folder."):
+        with only_here(self.folder):
             self.manifest = read_json(self.manifest_path)
             if not self.finished:
                 if (machine := describe_machine()) != machines(self.manifest)[-1]:

@@ -11,7 +11,7 @@ from typing import Any
 import pandas as pd
 
 from . import recorded, video
-from .cli import Parser
+from .cli import Parser, parse_settings
 from .decorated import Decorated, load_decorated
 from .demos.cli import Progress
 from .diffusion_analysis import resampled
@@ -30,7 +30,6 @@ from .sweep_spec import check_names
 from .tasks import get_task
 from .tasks.spec import TaskSpec
 from .torch_setup import set_threads
-from .train import parse_settings
 
 SAMPLING = ("temperature", "sampler", "sampler_steps", "spacing", "chunk")  # of a Diffusion Policy, whatever it was trained with
 

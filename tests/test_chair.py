@@ -19,7 +19,7 @@ from pdkit.tasks.chair import PushChair, StockPushChairSource, make_chair_env
 from pdkit.tasks.chair_assets import Chair, chairs, generated_chair
 from pdkit.tasks.chair_body import chair_start, solved
 from pdkit.tasks.partnet import UrdfWriter, link_parts
-from pdkit.train import base_demos
+from pdkit.train_base import base_demos
 from pdkit.video import try_render
 
 SAME_BITS = platform.machine() in ("x86_64", "AMD64")  # elsewhere a compiler may fuse operations

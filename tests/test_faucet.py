@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 from test_maniskill import BEFORE_CONTACT, SAME_BITS, play
 
-from pdkit import recorded, train
+from pdkit import recorded, train_decorated
 from pdkit.demos import save_demos, sources
 from pdkit.demos.experts import scripted_episodes
 from pdkit.demos.faucet_expert import TurnFaucetExpert
@@ -26,7 +26,7 @@ from pdkit.tasks import faucet_assets, get_task
 from pdkit.tasks.faucet import StockTurnFaucetSource, TurnFaucet, TurnFaucetSource, _corners
 from pdkit.tasks.faucet_assets import PARTNET_NOVEL, PARTNET_SOURCE, faucets, with_metadata
 from pdkit.tasks.partnet import VARIABLE, Model, object_set
-from pdkit.train import base_demos
+from pdkit.train_base import base_demos
 
 SPAN, AXIS, PLACE, LEFT = 32, slice(33, 36), slice(36, 39), 39
 
@@ -156,11 +156,11 @@ def test_results_on_ones_own_objects_are_not_mixed_with_those_on_generated_ones(
 def test_kept_episodes_of_a_base_policy_are_those_of_the_same_objects(monkeypatch, tmp_path):
     monkeypatch.setenv("PDKIT_RUNS", str(tmp_path))
     played = []
-    monkeypatch.setattr(train, "_episodes", lambda *given: played.append(1) or pd.DataFrame({"success_once": [len(played)]}))
+    monkeypatch.setattr(train_decorated, "reported", lambda *given: played.append(1) or pd.DataFrame({"success_once": [len(played)]}))
     spec, config = get_task("TurnFaucet"), online_config("TurnFaucet")
     base = load_policy(DATA / "checkpoints" / "TurnFaucet" / "base")
     for objects, first in (("", 1), ("PartNet-Mobility", 2), ("", 1)):
-        table = train._base_episodes(base, spec, 4, config, origin({"weights_sha256": "x"}, None, objects=objects))
+        table = train_decorated._base_episodes(base, spec, 4, config, origin({"weights_sha256": "x"}, None, objects=objects))
         assert table.success_once.tolist() == [first]
 
 

@@ -12,7 +12,7 @@ import pytest
 import torch
 from worlds import reach_demos
 
-from pdkit import check, cli, pixel_analysis, plots_pixels, train
+from pdkit import check, cli, pixel_analysis, plots_pixels, train, train_base, train_decorated
 from pdkit.demos import Demos, sources
 from pdkit.errors import PdkitError
 from pdkit.files import DATA
@@ -714,7 +714,8 @@ def test_figures_of_views_and_shifts():
     (["base", "PushChair", "--policy", "mlp", "--pixels", "--set", "random_shift=2"], "square pictures, not 50 x 125; set random_shift=0"),
     (["decorated", "Pen", "--pixels", "--base", str(DATA / "checkpoints" / "Door" / "pixels" / "base")], "robot of Door, not of Pen")])
 def test_a_bad_command_draws_nothing(monkeypatch, words, message):
-    monkeypatch.setattr(train, "pictures_of", lambda *given: pytest.fail("pictures were drawn"))
+    for command in (train_base, train_decorated):
+        monkeypatch.setattr(command, "pictures_of", lambda *given: pytest.fail("pictures were drawn"))
     with pytest.raises(PdkitError, match=message):
         train.main(words)
 

@@ -14,7 +14,7 @@ from worlds import reach_demos
 
 import pdkit.demos.sources as sources
 import pdkit.recorded as recorded
-from pdkit import cli, imitate, report, train
+from pdkit import cli, imitate, report, train, train_base, train_decorated
 from pdkit.decorated import load_decorated
 from pdkit.demos import load_demos, save_demos
 from pdkit.errors import PdkitError
@@ -29,7 +29,6 @@ from pdkit.runs import Run
 from pdkit.seeds import reported_seeds
 from pdkit.tasks import TASKS, get_task
 from pdkit.tensorboard import Board
-from pdkit.train import parse_settings
 
 
 def call(monkeypatch, *words):
@@ -38,10 +37,10 @@ def call(monkeypatch, *words):
 
 
 def test_settings_are_literals_or_words():
-    assert parse_settings(["alpha=0.2", "H=3", "warmup=base", "log_std_range=(-5.0, 1.0)"]) == {
+    assert cli.parse_settings(["alpha=0.2", "H=3", "warmup=base", "log_std_range=(-5.0, 1.0)"]) == {
         "alpha": 0.2, "H": 3, "warmup": "base", "log_std_range": (-5.0, 1.0)}
     with pytest.raises(PdkitError, match="NAME=VALUE"):
-        parse_settings(["alpha"])
+        cli.parse_settings(["alpha"])
 
 
 def test_demonstrations_from_the_command_line(monkeypatch, tmp_path, capsys):
@@ -167,7 +166,8 @@ def test_training_from_the_command_line_records_a_row_a_seed(monkeypatch, tmp_pa
     monkeypatch.setattr(recorded, "DATA", tmp_path)
     monkeypatch.setenv("PDKIT_RUNS", str(tmp_path / "runs"))
     refused = []
-    for owner, name, work in ((train.Trainer, "train", train.Trainer.train), (train, "_episodes", train._episodes)):  # each writes files
+    for owner, name, work in ((train_decorated.Trainer, "train", train_decorated.Trainer.train),
+                              (train_decorated, "reported", train_decorated.reported)):  # each writes files
         def watched(*given, work=work):
             with pytest.raises(PdkitError, match="Another process is at work in .*Door-smoke-seed0"):
                 with Run.alone(SimpleNamespace(folder=tmp_path / "runs" / "train" / "Door-smoke-seed0")):
@@ -192,7 +192,7 @@ def test_training_from_the_command_line_records_a_row_a_seed(monkeypatch, tmp_pa
     assert call(monkeypatch, *words) == 0 and pd.read_csv(tmp_path / "results" / "t.csv").base_success[0] == 0.25
     assert call(monkeypatch, *words, "--episodes", "3") == 0  # of other episodes there are others
     assert pd.read_csv(tmp_path / "results" / "t.csv").base_success[0] != 0.25
-    monkeypatch.setattr(train, "code_checksum", lambda: "edited")  # another task, perhaps: its base policy is tested anew
+    monkeypatch.setattr(train_decorated, "code_checksum", lambda: "edited")  # another task, perhaps: its base policy is tested anew
     assert call(monkeypatch, *words) == 0 and pd.read_csv(tmp_path / "results" / "t.csv").base_success[0] == table.base_success[0]
     policy = load_decorated(tmp_path / "runs" / "train" / "Door-smoke-seed0" / "decorated")
     base = load_policy(DATA / "checkpoints" / "Door" / "base")
@@ -207,7 +207,7 @@ def test_an_interrupted_training_tells_what_is_kept_and_how_to_go_on(monkeypatch
     def stop(*given):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(train, "decorate", stop)
+    monkeypatch.setattr(train_decorated, "decorate", stop)
     words = ["train", "decorated", "Door", "--profile", "smoke", "--method", "residual_rl"]
     assert call(monkeypatch, *words) == 130 and "Nothing had been saved yet; start again with: the same command." in capsys.readouterr().err
     folder = tmp_path / "train" / "Door-residual_rl,profile=smoke-seed0" / "checkpoint"  # not where the lesson's run is
@@ -236,14 +236,15 @@ def test_a_base_policy_that_samples_is_tested_on_random_numbers_of_each_run(monk
     """One draw for all runs would take a lucky start for what each of them lost."""
     monkeypatch.setenv("PDKIT_RUNS", str(tmp_path))
     drawn = []
-    monkeypatch.setattr(train, "evaluate", lambda *_, **__: drawn.append(torch.initial_seed()) or pd.DataFrame({"success_once": [0]}))
+    monkeypatch.setattr("pdkit.evaluate.evaluate",
+                        lambda *_, **__: drawn.append(torch.initial_seed()) or pd.DataFrame({"success_once": [0]}))
     for kind, wanted in (("diffusion", [0, 1, 2]), ("base", [0])):
         drawn.clear()
         policy = load_policy(DATA / "checkpoints" / "StackCube" / kind)
         assert policy.samples == (kind == "diffusion")
         for seed in (0, 1, 2, 1):
             config = online_config("StackCube", "lesson", seed)
-            train._base_episodes(policy, get_task("StackCube"), 2, config, {"base": kind})
+            train_decorated._base_episodes(policy, get_task("StackCube"), 2, config, {"base": kind})
         assert drawn == wanted
     shape = dict(obs_dim=3, act_dim=2, dims=[8])
     assert not DiffusionPolicy(shape | dict(temperature=0.0)).samples and DiffusionPolicy(shape | dict(sampler="ddpm")).samples
@@ -254,21 +255,21 @@ def test_episodes_of_code_from_elsewhere_are_not_kept(monkeypatch, tmp_path):
     """It may be another one the next time, by the same name and weights."""
     monkeypatch.setenv("PDKIT_RUNS", str(tmp_path))
     tested = []
-    monkeypatch.setattr(train, "evaluate", lambda *_, **__: tested.append(1) or pd.DataFrame({"success_once": [0]}))
+    monkeypatch.setattr("pdkit.evaluate.evaluate", lambda *_, **__: tested.append(1) or pd.DataFrame({"success_once": [0]}))
     door, base = get_task("Door"), load_policy(DATA / "checkpoints" / "Door" / "base")
     foreign = type("Mine", (ProbeBase,), {"__module__": "elsewhere"})(base.config | {"kind": "zero"})
     sim = type("Sim", (), {"__module__": "elsewhere"})
     for spec, policy, wanted in ((door, base, 1), (door, base, 0), (replace(door, max_episode_steps=9), base, 1), (door, foreign, 1),
                                  (door, foreign, 1), (replace(door, make=sim), base, 1), (replace(door, make=sim), base, 1)):
         tested.clear()
-        train._base_episodes(policy, spec, 2, online_config("Door", "lesson", 0), {"base": "x"})
+        train_decorated._base_episodes(policy, spec, 2, online_config("Door", "lesson", 0), {"base": "x"})
         assert len(tested) == wanted
 
 
 def test_the_command_of_a_row_can_be_pasted_into_a_shell():
     args = SimpleNamespace(task="Door", method="policy_decorator", profile="lesson", recipe="wide", episodes=60, threads=1, base="my base",
                            pixels=False, demos=None, num_demos=None, set=["alpha_scale=(1.0, 1.0)"], record="x")
-    words = shlex.split(train.command_of(args, 3))
+    words = shlex.split(train_decorated.command_of(args, 3))
     assert words[:3] == ["pdkit", "train", "decorated"] and words[words.index("--base") + 1] == "my base"
     assert words[words.index("--set") + 1] == "alpha_scale=(1.0, 1.0)" and words[words.index("--seeds") + 1] == "3"
 
@@ -344,10 +345,10 @@ def test_a_training_of_imitation_is_gone_on_with_by_the_same_command_alone(tmp_p
         raise KeyboardInterrupt
 
     monkeypatch.setattr(Saved, "save", interrupt)
-    monkeypatch.setattr(train, "pictures_of", lambda *_: object())
+    monkeypatch.setattr(train_base, "pictures_of", lambda *_: object())
     assert cli.main(_words(tmp_path / "base")) == 130
     monkeypatch.undo()
-    monkeypatch.setattr(train, "pictures_of", lambda *_: object())
+    monkeypatch.setattr(train_base, "pictures_of", lambda *_: object())
     for words, said in ((_words(tmp_path / "base", num=3), "(differing: demos, num_demos)"),
                         ([*_words(tmp_path / "base"), "--pixels"], "(differing: pixels)")):
         capsys.readouterr()
@@ -370,7 +371,7 @@ def test_an_imitation_is_not_repeated_for_its_test_nor_after_a_loss_that_is_no_n
     def interrupt(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(train, "_episodes", interrupt)
+    monkeypatch.setattr(train_base, "reported", interrupt)
     assert cli.main(words) == 130 and (tmp_path / "base" / "policy.json").exists()
     monkeypatch.undo()
     monkeypatch.setattr(POLICIES["mlp"], "loss", interrupt)
