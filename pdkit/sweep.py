@@ -90,6 +90,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--address", metavar="CLUSTER", help="use the Ray cluster at this address")
     parser.add_argument("--record", metavar="NAME", help="add the finished rows to data/results/NAME.csv (default: the spec's `record`)")
     parser.add_argument("--seeds", type=int, nargs="+", metavar="SEED", help="only these of the spec's seeds")
+    parser.add_argument("--tasks", nargs="+", metavar="TASK", help="only these of its tasks")
     parser.add_argument("--recipes", nargs="+", metavar="RECIPE", help="only these of its cells, by their recipe (--dry-run shows them)")
     parser.add_argument("--missing", action="store_true", help="leave out what data/results has already, from whichever machine "
                         "(not rows whose profile, base policy or notebook has changed since)")
@@ -102,7 +103,7 @@ def main(argv: list[str]) -> int:
         must_be_installed()
     spec = load_spec(args.spec)
     jobs, name = make_jobs(spec), args.record or spec.record
-    for wanted, label in ((args.seeds, "seed"), (args.recipes, "recipe")):
+    for wanted, label in ((args.seeds, "seed"), (args.tasks, "task"), (args.recipes, "recipe")):
         absent = [value for value in wanted or [] if value not in {job.labels[label] for job in jobs}]
         if absent:
             raise PdkitError(f"{spec.path.name} has no {label} {absent[0]}.")

@@ -437,12 +437,18 @@ def test_ctrl_c_is_told_with_what_is_kept_and_records_it(tmp_path, results, caps
     assert list(pd.read_csv(results / "tiny.csv").recipe) == ["alpha=0.1"]
 
 
-def test_some_of_the_seeds_and_recipes_alone(tmp_path, capsys):
+def test_some_of_the_seeds_tasks_and_recipes_alone(tmp_path, capsys):
     path = written(tmp_path, seeds=[0, 1, 2])
     assert cli.main(["sweep", str(path), "--seeds", "1", "2", "--recipes", "alpha=0.3", "--dry-run"]) == 0
     listed = capsys.readouterr().out
     assert listed.count("--recipe alpha=0.3 ") == listed.count("to do") == 2 and "--seeds 0" not in listed
-    for words, said in ((["--seeds", "7"], "no seed 7"), (["--recipes", "alpha=0.3", "alpha=9"], "no recipe alpha=9")):
+    two = written(tmp_path, grid={"task": ["Door", "Pen"]}, fixed={"profile": "smoke", "episodes": 2})
+    assert cli.main(["sweep", str(two), "--tasks", "Pen", "--dry-run"]) == 0
+    listed = capsys.readouterr().out
+    assert listed.count("train decorated Pen ") == listed.count("to do") == 1
+    path = written(tmp_path, seeds=[0, 1, 2])
+    for words, said in ((["--seeds", "7"], "no seed 7"), (["--tasks", "Door", "Pen"], "no task Pen"),
+                        (["--recipes", "alpha=0.3", "alpha=9"], "no recipe alpha=9")):
         assert cli.main(["sweep", str(path), *words, "--dry-run"]) == 2
         assert said in capsys.readouterr().err
 
