@@ -34,7 +34,7 @@ from .policies.base import read_card
 from .profiles import flat
 from .recorded import load
 from .runs import Run, origin
-from .stats import Interval, iqm, probability_of_improvement
+from .stats import Interval, iqm, mean, probability_of_improvement
 from .tasks import get_task
 from .tasks.partnet import object_set
 from .train_decorated import decorate
@@ -150,7 +150,7 @@ def league(table: pd.DataFrame, labels: Mapping[str, str] | None = None, referen
                "at_end": scores(table, recipe, "decorated_success_at_end").mean(), "minutes": scores(table, recipe, "train_minutes").mean()}
         row["iqm"] = row.pop("value")
         if not from_scratch(recipe):
-            row |= {"start": start.mean()} | _named("gain", over_seeds(np.mean, final - start))
+            row |= {"start": start.mean()} | _named("gain", over_seeds(mean, final - start))
         if theirs is not None and recipe != reference:
             row |= _named("p", over_seeds(probability_of_improvement, final, theirs))
         rows.append(row)
@@ -210,7 +210,7 @@ def smoothness(table: pd.DataFrame, labels: Mapping[str, str] | None = None) -> 
         row = {"recipe": recipe, "label": label, "seeds": len(success), "success": success.mean()}
         for name, column in (("jerk", "jerk"), ("change", "action_change")):
             ratio = scores(table, recipe, f"decorated_{column}") / scores(table, recipe, f"base_{column}")
-            logs = over_seeds(np.mean, np.log(np.maximum(ratio, LEAST_RATIO)))
+            logs = over_seeds(mean, np.log(np.maximum(ratio, LEAST_RATIO)))
             row |= {key: float(np.exp(value)) for key, value in _named(name, logs).items()}
         rows.append(row)
     return pd.DataFrame(rows)

@@ -5,6 +5,7 @@ A recipe keeps its colour in every figure of a notebook when both are given the 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import matplotlib as mpl
 import numpy as np
@@ -14,7 +15,7 @@ from matplotlib.axes import Axes
 from .claims import LEAST_SEEDS
 from .errors import PdkitError
 from .plots import COLORS, PALETTE, Picture, _columns, _percent, blank, styled
-from .stats import Interval, iqm, stratified_bootstrap
+from .stats import Interval, iqm, mean, stratified_bootstrap
 
 BOOTSTRAP_SEED = 0  # of every interval here: a figure drawn twice is the same
 
@@ -58,7 +59,7 @@ def dash(drawn: list[pd.Series], line: pd.Series) -> str:
     return "--" if hidden else "-"
 
 
-def over_seeds(statistic: Callable[..., float], *arrays: np.ndarray, repetitions: int = 2000) -> Interval:
+def over_seeds(statistic: Callable[..., Any], *arrays: np.ndarray, repetitions: int = 2000) -> Interval:
     """A statistic of one or two (runs x tasks) arrays with its bootstrap interval, which is NaN below three runs: one or two values would
     give one of no width."""
     if min(map(len, arrays)) < LEAST_SEEDS:
@@ -225,7 +226,7 @@ def _band(ax: Axes, curves: pd.DataFrame, recipe: str, column: str, color: str, 
         return
     by = nth(rows)
     step = by.step.mean()
-    limits = [over_seeds(np.mean, values.to_numpy()[:, None], repetitions=500) for _, values in by[column]]
+    limits = [over_seeds(mean, values.to_numpy()[:, None], repetitions=500) for _, values in by[column]]
     ax.plot(step, [i.value for i in limits], dash(drawn, by[column].mean()) + "o", ms=3.5, color=color,
             label=f"{label} ({rows.seed.nunique()})")
     ax.fill_between(step, [i.low for i in limits], [i.high for i in limits], color=color, alpha=0.15, lw=0)

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from .horizon_analysis import Progress
 from .plots import COLORS, PALETTE, Picture, _columns, _percent, blank, styled
 from .plots_compare import over_seeds
-from .stats import wilson
+from .stats import mean, wilson
 
 HORIZON = "horizon: share of the way to success that is left"
 WHO = {"random actions": COLORS["neither"], "base of the decorator": PALETTE[0], "base of fine-tuning": PALETTE[1],
@@ -127,7 +127,7 @@ def sweep_figure(table: pd.DataFrame, column: str, labels: dict[str, str], *, ow
             ax.plot(1 - fraction + shift + 0.004 * np.arange(len(lost)), [budget] * len(lost), "^", ms=7, mfc="white", color=color)
         groups = [(f, part[column]) for f, part in known.groupby("start_fraction")]
         for fraction, values in groups:
-            interval = over_seeds(np.mean, values.to_numpy()[:, None], repetitions=500)
+            interval = over_seeds(mean, values.to_numpy()[:, None], repetitions=500)
             ax.plot([1 - fraction + shift] * 2, [interval.low, interval.high], color=color, lw=2.2)
         ax.plot([1 - f + shift for f, _ in groups], [v.mean() for _, v in groups], "-o", ms=6, color=color, label=name)
     for run in () if trained is None else trained[trained.method.isin(present)].itertuples():

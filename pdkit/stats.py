@@ -154,39 +154,45 @@ def paired(base: pd.DataFrame, other: pd.DataFrame, column: str = "success_once"
 
 def _runs_by_tasks(scores: Any) -> np.ndarray:
     scores = np.asarray(scores, float)
-    if scores.ndim != 2 or not scores.size or not np.isfinite(scores).all():
+    if scores.ndim < 2 or not scores.size or not np.isfinite(scores).all():
         raise PdkitError(f"Scores must be a (runs x tasks) array of finite numbers, not of shape {scores.shape}.")
     return scores
 
 
-def iqm(scores: Any) -> float:
+# The three statistics below take one (runs x tasks) array, or many at once, (..., runs, tasks), with a value for each.
+
+def mean(scores: Any) -> Any:
+    """Mean of all numbers of a (runs x tasks) array."""
+    return _runs_by_tasks(scores).mean(axis=(-2, -1))
+
+
+def iqm(scores: Any) -> Any:
     """Interquartile mean of a (runs x tasks) array: the mean of the middle half of all its numbers."""
-    return float(scipy_stats.trim_mean(_runs_by_tasks(scores), 0.25, axis=None))
+    scores = _runs_by_tasks(scores)
+    return scipy_stats.trim_mean(scores.reshape(*scores.shape[:-2], -1), 0.25, axis=-1)
 
 
-def probability_of_improvement(scores: Any, other: Any) -> float:
+def probability_of_improvement(scores: Any, other: Any) -> Any:
     """Probability that a run of `scores` beats one of `other`, both (runs x tasks), on a random task (ties: half)."""
     scores, other = _runs_by_tasks(scores), _runs_by_tasks(other)
-    if scores.shape[1] != other.shape[1]:
-        raise PdkitError(f"Both sides need the same tasks, not {scores.shape[1]} and {other.shape[1]}.")
-    first, second = scores[:, None], other[None]
-    return float(np.mean((first > second) + 0.5 * (first == second)))
+    if scores.shape[-1] != other.shape[-1]:
+        raise PdkitError(f"Both sides need the same tasks, not {scores.shape[-1]} and {other.shape[-1]}.")
+    first, second = scores[..., :, None, :], other[..., None, :, :]
+    return np.mean((first > second) + 0.5 * (first == second), axis=(-3, -2, -1))
 
 
-def stratified_bootstrap(statistic: Callable[..., float], *scores: Any, seed: int, repetitions: int = 2000,
+def stratified_bootstrap(statistic: Callable[..., Any], *scores: Any, seed: int, repetitions: int = 2000,
                          confidence: float = 0.95) -> Interval:
     """`statistic(*scores)` with a percentile interval, for one or two (runs x tasks) arrays.
 
     Runs are drawn with replacement within each task (the strata), so a task keeps its weight. `seed` is explicit: the
-    same call gives the same interval. With fewer than about 5 runs such intervals are too narrow.
+    same call gives the same interval. With fewer than about 5 runs such intervals are too narrow. The statistic is asked once for all
+    repetitions, of (repetitions, runs, tasks), and gives a value for each.
     """
     _z(confidence)  # rejects a level outside (0, 1)
     arrays = [_runs_by_tasks(s) for s in scores]
     rng = np.random.default_rng(seed)
-
-    def redrawn(array: np.ndarray) -> np.ndarray:
-        return np.take_along_axis(array, rng.integers(len(array), size=array.shape), axis=0)
-
-    values = [statistic(*map(redrawn, arrays)) for _ in range(repetitions)]
+    drawn = [rng.integers(len(array), size=(repetitions, *array.shape)) for array in arrays]
+    values = statistic(*[np.take_along_axis(array[None], rows, axis=1) for array, rows in zip(arrays, drawn, strict=True)])
     low, high = np.quantile(values, [0.5 - confidence / 2, 0.5 + confidence / 2])
     return Interval(float(statistic(*arrays)), float(low), float(high))
