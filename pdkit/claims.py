@@ -245,7 +245,17 @@ def signed(value: float) -> str:
 
 
 def points(interval: Interval) -> str:
-    return f"{100 * interval.low:+.1f} to {100 * interval.high:+.1f} points ({METHOD})"
+    """An interval of a difference of shares in words: within what is possible, and none where all seeds say the same, whose spread tells
+    nothing."""
+    low, high = (100 * min(max(limit, -1.0), 1.0) for limit in (interval.low, interval.high))
+    if high - low < 0.05:
+        return f"{low:+.1f} points by every seed, whose spread gives no interval"
+    return f"{low:+.1f} to {high:+.1f} points ({METHOD})"
+
+
+def shares(interval: Interval) -> str:
+    """An interval of a share in words, within what is possible."""
+    return f"{percent(max(interval.low, 0.0))} to {percent(min(interval.high, 1.0))}"
 
 
 def times(interval: Interval, digits: int = 2) -> str:

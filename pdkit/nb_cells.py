@@ -5,6 +5,7 @@ import ast
 import hashlib
 import io
 import json
+import re
 import tokenize
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +18,7 @@ from .errors import PdkitError, unknown
 PROFILES = ("smoke", "lesson", "paper")
 REQUIRED = ("profile", "out")  # parameters that every notebook has
 MAX_CELLS, MAX_LINES = 35, 40
+ONLY = re.compile(r"(?:\w+ )?or (\w+)(?=[,:;]|$)")  # the comment of a `task` that can be the default or one other task, and no third
 KINDS = {kind.__name__: kind for kind in (bool, int, float, str, list, dict)}
 
 
@@ -150,6 +152,8 @@ def checked(notebook: str, known: dict[str, Parameter], given: dict[str, Any]) -
         values[name] = _fit(_plain(value), known[name])
     if values.get("profile", PROFILES[0]) not in PROFILES:
         raise unknown("profile", values["profile"], PROFILES)
+    if "task" in values and (only := ONLY.match(known["task"].help)) and values["task"] not in (both := {known["task"].default, only[1]}):
+        raise unknown(f"task of {notebook}", values["task"], both)
     return values
 
 

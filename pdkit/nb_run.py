@@ -19,6 +19,7 @@ from .files import ROOT
 from .nb import PROGRESS_FILE, Line
 from .nb_cells import code_cells, read_notebook
 
+MOST = 600  # letters of a notebook's own words that a line shows
 
 class ThisInterpreter(AsyncKernelManager):
     """A kernel manager whose kernelspec is made here: always this interpreter, whatever the machine has registered."""
@@ -74,7 +75,8 @@ def execute(path: Path, values: dict[str, Any], out: Path, timeout: float | None
 
 def _one_line(text: str) -> str:
     """A notebook's words for a terminal: without line breaks, and without the escape sequences by which they could command it."""
-    return "".join(letter for letter in " ".join(text.split()) if letter.isprintable()).rstrip(".")[:300]
+    line = "".join(letter for letter in " ".join(text.split()) if letter.isprintable()).rstrip(".")
+    return line if len(line) <= MOST else f"{line[:MOST // 2]} ... {line[-MOST // 2:]}"  # what to do stands at the end
 
 
 def _kept(output: Path, watch: _Progress, kind: str, what: str) -> PdkitError:

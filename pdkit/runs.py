@@ -4,7 +4,7 @@ from __future__ import annotations
 import platform
 import subprocess
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from datetime import UTC, datetime
 from importlib import metadata
@@ -74,26 +74,29 @@ def only_here(folder: Path) -> AbstractContextManager[None]:
 
 
 class Run:
-    """One run folder. Opening an existing one with the same parameters resumes it; with other parameters is an error."""
+    """One run folder. Opening an existing one with the same parameters resumes it; with other parameters is an error.
 
-    def __init__(self, folder: str | Path, kind: str, parameters: dict[str, Any]):
+    Of parameters that are newer than the run, which its manifest does not tell, it had the `defaults`.
+    """
+
+    def __init__(self, folder: str | Path, kind: str, parameters: dict[str, Any], defaults: Mapping[str, Any] | None = None):
         self.folder = Path(folder)
         self.manifest_path = self.folder / "manifest.json"
         recover(self.folder / "checkpoint")
         if self.manifest_path.exists():
             self.manifest = read_json(self.manifest_path)
-            self._must_match(kind, parameters)
+            self._must_match(kind, parameters, defaults or {})
         elif self.has_checkpoint:
             raise PdkitError(f"{self.folder} holds a checkpoint without the manifest.json that would tell of what; delete that folder.")
         else:
             self.manifest = {"kind": kind, "parameters": parameters, "started": _now(), "finished": None, "machine": describe_machine()}
             self._write_manifest()
 
-    def _must_match(self, kind: str, parameters: dict[str, Any]) -> None:
+    def _must_match(self, kind: str, parameters: dict[str, Any], defaults: Mapping[str, Any]) -> None:
         import json
 
-        asked = json.loads(json.dumps(parameters))
-        old = self.manifest.get("parameters", {})
+        asked, usual = json.loads(json.dumps([parameters, dict(defaults)]))
+        old = {name: usual[name] for name in usual.keys() & asked.keys()} | self.manifest.get("parameters", {})
         differing = sorted(k for k in (asked.keys() | old.keys()) - NO_MATTER if asked.get(k) != old.get(k))
         if self.manifest.get("kind") != kind or differing:
             raise PdkitError(f"{self.folder} holds another run (differing: {', '.join(differing) or 'kind'}); choose another folder or "

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 
 from . import nb
 from .cli import Parser
-from .errors import PdkitError
+from .errors import PdkitError, unknown
 from .files import ROOT, locked, runs_root
 from .main_job import duration
 from .sweep_jobs import OF_BASE, bases_to_make, finished, make_jobs, missing, outdated, unlike_recorded
@@ -90,7 +90,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--address", metavar="CLUSTER", help="use the Ray cluster at this address")
     parser.add_argument("--record", metavar="NAME", help="add the finished rows to data/results/NAME.csv (default: the spec's `record`)")
     parser.add_argument("--seeds", type=int, nargs="+", metavar="SEED", help="only these of the spec's seeds")
-    parser.add_argument("--tasks", nargs="+", metavar="TASK", help="only these of its tasks")
+    parser.add_argument("--tasks", nargs="+", metavar="TASK", help="only these of its tasks (of a notebook that is given none: its name)")
     parser.add_argument("--recipes", nargs="+", metavar="RECIPE", help="only these of its cells, by their recipe (--dry-run shows them)")
     parser.add_argument("--missing", action="store_true", help="leave out what data/results has already, from whichever machine "
                         "(not rows whose profile, base policy or notebook has changed since)")
@@ -104,12 +104,16 @@ def main(argv: list[str]) -> int:
     spec = load_spec(args.spec)
     jobs, name = make_jobs(spec), args.record or spec.record
     for wanted, label in ((args.seeds, "seed"), (args.tasks, "task"), (args.recipes, "recipe")):
-        absent = [value for value in wanted or [] if value not in {job.labels[label] for job in jobs}]
-        if absent:
-            raise PdkitError(f"{spec.path.name} has no {label} {absent[0]}.")
+        known = {job.labels[label] for job in jobs}
+        for value in wanted or ():
+            if value not in known:
+                raise unknown(f"{label} of {spec.path.name}", value, known)
         jobs = [job for job in jobs if not wanted or job.labels[label] in wanted]
     if args.missing:
         jobs = missing(jobs, name)
+        if not jobs:
+            print(f"Nothing is missing: data/results/{name}.csv has all of it.")
+            return 0
     if len(old := outdated(jobs)) > 1:
         raise PdkitError(f"{len(old)} jobs were finished with other values than their methods and profiles, or notebooks, now give; delete "
                          f"these folders to run them again: {' '.join(shlex.quote(str(job.folder)) for job in old)}")
@@ -118,7 +122,7 @@ def main(argv: list[str]) -> int:
         print(*map(_listing, [*bases, *jobs]), sep="\n")
         return 0
     path = spec.path.resolve()
-    command = f"pdkit sweep {path.relative_to(ROOT) if path.is_relative_to(ROOT) else path.name}"
+    command = f"pdkit sweep {shlex.quote(str(path.relative_to(ROOT) if path.is_relative_to(ROOT) else path))}"
     command += f" --record {args.record}" if args.record else ""
     problems: dict[str, str] | None = None
     with _alone(spec.name):

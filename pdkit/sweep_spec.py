@@ -38,6 +38,7 @@ from pathlib import Path
 from typing import Any
 
 from .errors import PdkitError, unknown
+from .recorded import check_name
 
 KINDS = ("train", "base", "notebook")
 SHA256 = re.compile(r"[0-9a-f]{64}")
@@ -62,9 +63,12 @@ class Spec:
 
 
 def check_names(record_as: str | None, recipe: str | None = None) -> None:
-    """Raises PdkitError for a record's name that is no word, or a recipe that would leave its folder: before the work, not after."""
-    if record_as is not None and not NAME.fullmatch(record_as):
-        raise PdkitError(f"--record takes a name of letters, digits, dots and dashes, not {record_as!r}.")
+    """Raises PdkitError for a record's name that is no word or no table of runs, or a recipe that would leave its folder: before the work,
+    not after."""
+    if record_as is not None:
+        if not NAME.fullmatch(record_as):
+            raise PdkitError(f"--record takes a name of letters, digits, dots and dashes, not {record_as!r}.")
+        check_name(record_as)
     if recipe is not None and ("/" in recipe or recipe.startswith(".") or not recipe):
         raise PdkitError(f"--recipe becomes part of a folder's name; {recipe!r} cannot.")
 
@@ -79,6 +83,8 @@ def load_spec(path: str | Path) -> Spec:
     for key in ("name", "record"):
         if not (isinstance(values.get(key, "x"), str) and NAME.fullmatch(values.get(key, "x"))):
             raise PdkitError(f"{path.name}: {key} must be a word of letters, digits, dots and dashes, not {values[key]!r}.")
+    if "record" in values:
+        check_name(values["record"])
     for key, kind in (("fixed", dict), ("grid", dict), ("cells", list), ("seeds", list), ("bases", dict)):
         if not isinstance(values.get(key, kind()), kind):
             raise PdkitError(f"{path.name}: {key} must be a {'table' if kind is dict else 'list'}, not {values[key]!r}.")

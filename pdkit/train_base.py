@@ -15,7 +15,7 @@ from .demos.cli import Progress
 from .errors import PdkitError
 from .evaluate import outcome, reported
 from .files import check_replaceable, discard, runs_root, write_json
-from .imitate import Diverged, configured, imitate
+from .imitate import Diverged, ImitateConfig, configured, imitate
 from .main_job import duration
 from .pixels.cameras import view_of
 from .pixels.learn import check_pixels, imitate_pixels, look_up, visual_settings
@@ -111,7 +111,7 @@ def _training(folder: Path, what: dict[str, Any]) -> Iterator[Run]:
     if folder.exists() and not (folder / "checkpoint" / "state.json").exists():  # a killed process left nothing else
         with only_here(folder):
             discard(folder)
-    run = Run(folder, "base", what)
+    run = Run(folder, "base", what, asdict(ImitateConfig()))
     with run.alone():
         if run.has_checkpoint:
             print(kept_so_far(folder).partition(";")[0] + "; it goes on from there.", flush=True)

@@ -102,7 +102,7 @@ def decorate(config, base: Policy, demos: Demos | None, out: Path, episodes: int
     With an `encoder` the task is seen through it, and so are the demonstrations.
     """
     trainer = make_trainer(config, base, demos, pixel_spec(get_task(config.task), encoder) if encoder else None)
-    run = Run(out, "decorated", flat(config) | started_from)  # after what may be refused
+    run = Run(out, "decorated", flat(config) | started_from, flat(OnlineConfig()))  # after what may be refused
     with run.alone():
         if run.finished:
             print(run.already(), flush=True)

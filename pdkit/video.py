@@ -69,14 +69,14 @@ class Clip:
 def try_render(spec: TaskSpec) -> str | None:
     """None if episodes of this task can be drawn here, else one sentence that says why not.
 
-    The first call for a simulator draws a picture in a process of its own, so that a crash of a graphics driver cannot
-    take the caller with it. For MuJoCo it also sets MUJOCO_GL to a backend that works.
+    The first call for MuJoCo or SAPIEN draws a picture in a process of its own, so that a crash of a graphics driver cannot
+    take the caller with it. For MuJoCo it also sets MUJOCO_GL to a backend that works. Of other simulators one is asked for a picture.
     """
     if os.environ.get(SWITCH, "").lower() in ("off", "0", "no"):
         return f"Pictures are turned off ({SWITCH}=off); everything else runs the same."
     if spec.plan_view:
         return None
-    return _try_mujoco() if spec.suite == "adroit" else _try_sapien()
+    return _try_mujoco() if spec.suite == "adroit" else _try_sapien() if spec.suite == "maniskill" else _try_own(spec)
 
 
 @functools.cache
@@ -109,6 +109,18 @@ def _try_sapien() -> str | None:
         return None
     return ("No pictures: ManiSkill needs a working Vulkan driver to draw, and there is none; `pdkit doctor` tells how "
             "to get one. Everything else runs the same.")
+
+
+def _try_own(spec: TaskSpec) -> str | None:
+    try:
+        sim = spec.make(render=True)
+        sim.reset(0)
+        sim.render()
+        sim.close()
+    except Exception as error:  # whatever someone's simulator raises
+        return (f"No pictures: the simulator of {spec.name} draws none ({type(error).__name__}: {error}); for pictures make(render=True) "
+                "gives one whose render() returns an (H, W, 3) array. Everything else runs the same.")
+    return None
 
 
 # ---- recording -------------------------------------------------------------------------------------------------------

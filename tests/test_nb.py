@@ -11,7 +11,7 @@ import nbformat
 import numpy as np
 import pytest
 
-from pdkit import nb
+from pdkit import nb, nb_cells
 from pdkit.cli import main
 from pdkit.errors import PdkitError
 from pdkit.nb_cells import parse_parameters
@@ -117,6 +117,26 @@ def test_a_failing_cell_is_one_sentence_and_leaves_no_old_result(folder, tmp_pat
     assert errors_in(tmp_path / "01_first.ipynb") == ["ValueError"]
 
 
+def test_of_a_long_sentence_its_end_is_kept(folder, tmp_path):
+    write(folder / "01_first.ipynb", "raise ValueError('x' * 2_000 + ' Did you mean y?')", FINISH, parameters=SIMPLE)
+    with pytest.raises(PdkitError, match=r"\(ValueError: x{300} \.\.\. x+ Did you mean y\?\); the traceback"):
+        nb.run_notebook("01_first", {}, tmp_path, progress=False)
+
+
+@pytest.mark.parametrize("words, refused", [
+    ("or StackCube", True), ("or StackCube, the paper's", True), ("TurnFaucet or PushChair", True),
+    ("Door, StackCube, or another one that comes with a base policy", False), ("or another task that comes with demonstrations", False),
+    ("Door, StackCube, or Pen (PPO alone): what is compared", False), ("", False)])
+def test_a_task_is_refused_where_the_comment_names_the_two_that_there_are(words, refused):
+    known = nb_cells.parse_parameters(f"task = 'Door'  # {words}")
+    for task, ok in (("Door", True), (words.partition("or ")[2].partition(",")[0], True), ("Hammer", not refused)):
+        if ok:
+            assert nb_cells.checked("x", known, {"task": task}) == {"task": task}
+        else:
+            with pytest.raises(PdkitError, match="Unknown task of x 'Hammer'"):
+                nb_cells.checked("x", known, {"task": task})
+
+
 def test_what_fails_after_its_result_has_none_and_does_not_command_the_terminal(folder, tmp_path):
     write(folder / "01_first.ipynb", FINISH, "raise type('\\x1b[3JValueError', (Exception,), {})('\\x1b[2Jboom\\x07')", parameters=SIMPLE)
     with pytest.raises(PdkitError) as error:
@@ -197,6 +217,7 @@ def test_the_notebooks_own_progress_line_reaches_the_terminal(folder, tmp_path, 
     (["01", "-p", "alpha=1", "-p", "alpha=2"], "Parameter alpha is given twice"),
     (["01", "-p", "out=x"], "given by --out"),
     (["01", "--profile", "huge"], "Unknown profile 'huge'"),
+    (["04", "-p", "task=Pen"], "Unknown task of 04_fourth 'Pen'; choose one of: Door, StackCube."),
     (["01", "--timeout", "0"], "--timeout must be more than 0"),
     (["01", "--timeout", "soon"], "pdkit nb: argument --timeout: invalid float value"),
     (["01", "--bogus"], "pdkit nb: unrecognized arguments: --bogus"),
@@ -208,9 +229,11 @@ def test_bad_input_is_one_sentence_and_nothing_runs(folder, tmp_path, capsys, ar
     write(folder / "01_first.ipynb", "raise SystemError('it ran')", parameters=SIMPLE)
     write(folder / "02_second.ipynb", FINISH, parameters='profile = ""\nout = ""\nalpha = 1 / 3')
     (folder / "03_third.ipynb").write_text('{"cells": [')
+    write(folder / "04_fourth.ipynb", "raise SystemError('it ran')", parameters=f"{SIMPLE}\ntask = 'Door'  # or StackCube, the paper's")
     (tmp_path / "file").write_text("")
     if arguments == ["0"]:
-        (folder / "03_third.ipynb").unlink()
+        for name in ("03_third", "04_fourth"):
+            (folder / f"{name}.ipynb").unlink()
     assert main(["nb", *(argument.format(file=tmp_path / "file") for argument in arguments)]) == 2
     captured = capsys.readouterr()
     assert len(captured.err.strip().splitlines()) == 1

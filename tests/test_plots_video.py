@@ -1,5 +1,6 @@
 """Figures show what their data says; videos, contact sheets and pages are what they claim, with or without a display."""
 import base64
+import dataclasses
 import os
 import re
 import subprocess
@@ -336,3 +337,24 @@ def test_page_names_a_missing_file(tmp_path):
     (tmp_path / "a.png").write_text("text")
     with pytest.raises(PdkitError, match="no PNG|is not a PNG"):
         page.figure(tmp_path / "a.png")
+
+
+def test_a_simulator_of_ones_own_is_asked_for_a_picture():
+    class Mute:
+        def reset(self, seed):
+            return np.zeros(2)
+
+        def close(self):
+            pass
+
+    class Draws(Mute):
+        def __init__(self, render=False):
+            assert render
+
+        def render(self):
+            return np.zeros((4, 4, 3), np.uint8)
+
+    spec = dataclasses.replace(get_task("Door"), name="mine", suite="mine", make=Mute)
+    assert "the simulator of mine draws none (TypeError" in video.try_render(spec)
+    assert video.try_render(dataclasses.replace(spec, make=Draws)) is None
+    assert "AttributeError" in video.try_render(dataclasses.replace(spec, make=lambda render: Mute()))

@@ -138,3 +138,24 @@ def test_a_record_s_name_is_a_word(name):
     with pytest.raises(PdkitError, match="--recipe"):
         check_names(None, name)
     check_names("my-record.2", "fish,features=GPT")
+
+
+@pytest.mark.parametrize("recipe", ["7", "None", "1e3", "true"])
+def test_a_recipe_is_a_word_whatever_it_looks_like(results, recipe):
+    """A table of whole numbers, or of nothing, could not be merged with one of words."""
+    row = {"task": "Door", "seed": 0, "command": "pdkit", "base_success": 0.5}
+    for name in (recipe, recipe, "other"):
+        rows = pd.DataFrame([row | {"recipe": name}])
+        recorded.record("x", rows, rows[recorded.KEYS].assign(step=10))
+        assert recipe in recorded.load("x")[0].recipe.tolist()
+    assert all(sorted(table.recipe) == sorted(["other", recipe]) for table in recorded.load("x"))
+
+
+def test_only_tables_of_runs_can_be_recorded_in(results):
+    for name, columns in (("claims", ["claim", "verdict"]), ("runs", recorded.KEYS)):
+        pd.DataFrame(columns=columns).to_csv(results / f"{name}.csv", index=False)
+    check_names("runs")
+    check_names("new")
+    for name in ("claims", "runs_curves"):
+        with pytest.raises(PdkitError, match=f"{name}.csv is no table of runs"):
+            check_names(name)

@@ -447,8 +447,10 @@ def test_some_of_the_seeds_tasks_and_recipes_alone(tmp_path, capsys):
     listed = capsys.readouterr().out
     assert listed.count("train decorated Pen ") == listed.count("to do") == 1
     path = written(tmp_path, seeds=[0, 1, 2])
-    for words, said in ((["--seeds", "7"], "no seed 7"), (["--tasks", "Door", "Pen"], "no task Pen"),
-                        (["--recipes", "alpha=0.3", "alpha=9"], "no recipe alpha=9")):
+    for words, said in ((["--seeds", "7"], "Unknown seed of spec.json '7'; choose one of: 0, 1, 2."),
+                        (["--tasks", "Door", "Pen"], "Unknown task of spec.json 'Pen'; choose one of: Door."),
+                        (["--recipes", "alpha=0.3", "alpha=9"],
+                         "Unknown recipe of spec.json 'alpha=9'; choose one of: alpha=0.1, alpha=0.3.")):
         assert cli.main(["sweep", str(path), *words, "--dry-run"]) == 2
         assert said in capsys.readouterr().err
 
@@ -465,6 +467,11 @@ def test_missing_leaves_out_what_is_recorded_by_the_same_command_alone(tmp_path,
     monkeypatch.setattr(sweep, "run_jobs", lambda jobs, *_: started.extend(jobs) or {})
     assert cli.main(["sweep", str(path), "--record", "tiny", "--missing"]) == 0
     assert started == [second] and len(pd.read_csv(results / "tiny.csv")) == 2
+    recorded.record("tiny", pd.DataFrame([second.labels | {"command": second.command}]), pd.DataFrame())
+    capsys.readouterr()
+    for words in ([], ["--dry-run"]):
+        assert cli.main(["sweep", str(path), "--record", "tiny", "--missing", *words]) == 0
+        assert capsys.readouterr().out == "Nothing is missing: data/results/tiny.csv has all of it.\n" and started == [second]
 
 
 def test_rows_whose_settings_have_changed_since_are_missing(tmp_path, results):

@@ -394,3 +394,20 @@ def test_a_task_of_ones_own_takes_one_entry_in_the_registry(monkeypatch, tmp_pat
                 "--episodes", "2", "--out", str(out)) == 0
     assert "task Mine, method policy_decorator" in capsys.readouterr().out
     assert load_decorated(out / "Mine-smoke-seed0" / "decorated").base.kind == "mlp"
+
+
+def test_a_field_that_is_newer_than_a_run_had_its_default(tmp_path):
+    Run(tmp_path / "x", "decorated", {"alpha": 0.1})
+    assert not Run(tmp_path / "x", "decorated", {"alpha": 0.1, "mine": 0.5}, {"alpha": 0.3, "mine": 0.5}).finished
+    for asked, differing in (({"alpha": 0.1, "mine": 0.7}, "mine"), ({"alpha": 0.3, "mine": 0.5}, "alpha"), ({"mine": 0.5}, "alpha"),
+                             ({"alpha": 0.1, "mine": 0.5, "encoder": "e"}, "encoder")):
+        with pytest.raises(PdkitError, match=rf"another run \(differing: {differing}\)"):
+            Run(tmp_path / "x", "decorated", asked, {"alpha": 0.3, "mine": 0.5})
+
+
+def test_a_task_that_nobody_here_can_demonstrate_is_said_with_what_to_do(monkeypatch, capsys):
+    monkeypatch.setitem(TASKS, "Mine", replace(get_task("Door"), name="Mine"))
+    assert call(monkeypatch, "demos", "Mine") == 2 and "from_episodes and save_demos" in capsys.readouterr().err
+    assert call(monkeypatch, "train", "base", "Mine") == 2
+    said = capsys.readouterr().err
+    assert "No demonstrations of Mine are bundled" in said and "--demos" in said and "from_episodes" in said

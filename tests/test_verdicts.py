@@ -960,3 +960,11 @@ def test_dppo_is_compared_on_other_tasks_than_the_papers(results):
             assert all(mine in each.measured and f"beside them {other} 10.0 %" in each.measured for each in found)
     write(results, "diffusion_finetuning", runs(OWN, [0.8], task="StackCube"), runs("dppo", [0.1], task="StackCube"))
     assert verdicts.find(claim) is None
+
+
+def test_intervals_in_words_stay_within_what_is_possible():
+    assert claims.points(Interval(0.86, 0.609, 1.111)) == "+60.9 to +100.0 points (Student's t over seeds, 95 %)"
+    assert claims.points(Interval(-0.826, -1.24, -0.413)).startswith("-100.0 to -41.3 points")
+    assert claims.points(Interval(-0.508, -0.508, -0.508)) == "-50.8 points by every seed, whose spread gives no interval"
+    assert claims.shares(Interval(0.98, 0.943, 1.017)) == "94.3 % to 100.0 %"
+    assert claims.shares(Interval(0.007, -0.012, 0.026)) == "0.0 % to 2.6 %"

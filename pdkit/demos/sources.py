@@ -35,7 +35,8 @@ def bundled(task: str) -> Demos:
     path = DATA / "demos" / f"{shown}.safetensors"
     if not path.exists():
         have = ", ".join(sorted(p.stem for p in path.parent.glob("*.safetensors"))) or "none"
-        raise PdkitError(f"No demonstrations of {shown} are bundled (there are: {have}); make some with `pdkit demos`.")
+        raise PdkitError(f"No demonstrations of {shown} are bundled (there are: {have}); make some with `pdkit demos {shown}`, or name a "
+                         "file of your own (--demos; pdkit.demos.from_episodes and save_demos make one).")
     return _warned_of_objects(load_demos(path))
 
 

@@ -33,7 +33,7 @@ class TaskSpec:
     """A task of the paper (appendix A, Tables 2 and 3) as it runs here."""
 
     name: str
-    suite: str  # "adroit" (MuJoCo, gymnasium-robotics) or "maniskill" (SAPIEN)
+    suite: str  # "adroit" (MuJoCo, gymnasium-robotics) or "maniskill" (SAPIEN), or a word of your own
     obs_dim: int  # state observation
     act_dim: int
     max_episode_steps: int  # the paper's limit, in primitive steps

@@ -35,6 +35,7 @@ from ..claims import (
     recorded,
     set_against,
     set_apart,
+    shares,
     signed,
     task_by_task,
     times,
@@ -94,7 +95,7 @@ def _() -> Finding:
     ends, _ = named_by(ADROIT, by_seed(recorded("calql")[0], "calql_c", "decorated_success"))
     high = mean_interval(ends)
     return finding("calql", values, f"B and C: {told}; C ends at {percent(average(ends))}{task_by_task(ends, percent)}",
-                   f"cost {points(interval)}; C {percent(high.low)} to {percent(high.high)}",
+                   f"cost {points(interval)}; C {shares(high)}",
                    jointly(judged_over_tasks(-values, -0.1), judged_over_tasks(ends, 0.9)))
 
 
@@ -255,7 +256,7 @@ def _() -> Finding:
     lifts, kept = by_seed(rows, "x", "lifted.before"), by_seed(rows, "x", "lifted.random critic, 200")
     share = mean_interval(kept / lifts)
     return finding("unlearning", kept, f"cube lifted {percent(lifts.mean())} before, {percent(kept.mean())} after (one policy)",
-                   f"{percent(share.low)} to {percent(share.high)} of what it was ({METHOD})",
+                   f"{shares(share)} of what it was ({METHOD})",
                    judged(turned(share), -0.5))
 
 

@@ -42,6 +42,7 @@ from ..claims import (
     points,
     recorded,
     set_against,
+    shares,
     signed,
     task_by_task,
     times,
@@ -82,7 +83,7 @@ def _lifted(suites: tuple[str, ...]) -> Finding:
     (gain, values), level = difference(end, start), mean_interval(end)
     return finding(records if len(bets) else records[0], values,
                    f"from {percent(average(start))} to {percent(average(end))}{task_by_task(end, percent)}"
-                   + not_counted(runs[~judged_here]), f"gain {points(gain)}; level {percent(level.low)} to {percent(level.high)}",
+                   + not_counted(runs[~judged_here]), f"gain {points(gain)}; level {shares(level)}",
                    jointly(judged_over_tasks(values), judged(level, NEARLY)), wanted)
 
 
@@ -119,7 +120,7 @@ def _() -> Finding:
     share, level = wilson(reached, len(end)), mean_interval(end)
     return finding("main_job", end, f"{reached} of {len(end)} seeds reach {100 * NEARLY:.0f} % (base {percent(average(start))}); mean "
                    f"{percent(level.value)}", f"share of seeds {100 * share.low:.0f} to {100 * share.high:.0f} % (Wilson, 95 %); mean "
-                   f"{100 * level.low:.1f} to {100 * min(level.high, 1.0):.1f} % ({METHOD})",
+                   f"{shares(level)} ({METHOD})",
                    "reproduced" if share.low > 0.5 else "partly" if share.value > 0.5 else "not")
 
 
