@@ -122,7 +122,7 @@ def main(argv: list[str]) -> int:
         print(*map(_listing, [*bases, *jobs]), sep="\n")
         return 0
     path = spec.path.resolve()
-    command = f"pdkit sweep {shlex.quote(str(path.relative_to(ROOT) if path.is_relative_to(ROOT) else path))}"
+    command = f"pdkit sweep {path.relative_to(ROOT) if path.is_relative_to(ROOT) else path.name}"
     command += f" --record {args.record}" if args.record else ""
     problems: dict[str, str] | None = None
     with _alone(spec.name):

@@ -126,4 +126,4 @@ def test_the_claim_about_door_says_what_the_recorded_rows_say():
     assert claim.measured.startswith(f"{good.successes} of {good.n} seeds reach 95 %")
     assert f"mean {100 * ends.mean():.1f} %" in claim.measured
     assert f"{100 * good.low:.0f} to {100 * good.high:.0f} % (Wilson" in claim.interval
-    assert f"mean {100 * low:.1f} to {100 * min(high, 1):.1f} %" in claim.interval
+    assert f"mean {100 * low:.1f} % to {100 * min(high, 1):.1f} %" in claim.interval
