@@ -18,7 +18,7 @@ from .errors import PdkitError, unknown
 PROFILES = ("smoke", "lesson", "paper")
 REQUIRED = ("profile", "out")  # parameters that every notebook has
 MAX_CELLS, MAX_LINES = 35, 40
-ONLY = re.compile(r"(?:\w+ )?or (\w+)(?=[,:;]|$)")  # the comment of a `task` that can be the default or one other task, and no third
+ONLY = re.compile(r"(\w+ )?or (\w+)( ?[,:;(]|$)")  # how the comment of a `task` begins that can only be one of the tasks which it names
 KINDS = {kind.__name__: kind for kind in (bool, int, float, str, list, dict)}
 
 
@@ -152,9 +152,19 @@ def checked(notebook: str, known: dict[str, Parameter], given: dict[str, Any]) -
         values[name] = _fit(_plain(value), known[name])
     if values.get("profile", PROFILES[0]) not in PROFILES:
         raise unknown("profile", values["profile"], PROFILES)
-    if "task" in values and (only := ONLY.match(known["task"].help)) and values["task"] not in (both := {known["task"].default, only[1]}):
-        raise unknown(f"task of {notebook}", values["task"], both)
+    if "task" in values and values["task"] not in (tasks := _tasks(known["task"])):
+        raise unknown(f"task of {notebook}", values["task"], tasks)
     return values
+
+
+def _tasks(parameter: Parameter) -> set[str]:
+    """The tasks that a notebook has by the comment of its `task` ("or StackCube, the paper's"): all where it names no second one so."""
+    from .tasks import TASKS
+
+    begins = ONLY.match(parameter.help)
+    if not begins or begins[2] not in TASKS:
+        return set(TASKS)
+    return {parameter.default, *(set(re.findall(r"\w+", parameter.help)) & set(TASKS))}
 
 
 def _plain(value: Any) -> Any:

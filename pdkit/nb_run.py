@@ -19,7 +19,8 @@ from .files import ROOT
 from .nb import PROGRESS_FILE, Line
 from .nb_cells import code_cells, read_notebook
 
-MOST = 600  # letters of a notebook's own words that a line shows
+MOST = 600  # letters of a notebook's own words that a line shows, its middle left out
+
 
 class ThisInterpreter(AsyncKernelManager):
     """A kernel manager whose kernelspec is made here: always this interpreter, whatever the machine has registered."""

@@ -31,6 +31,7 @@ TRAINING = "pdkit train decorated"  # how a command that makes a row of a traini
 SETTINGS = "settings"  # the column that tells rows of other settings apart: a `mark`, whose settings the manifest holds
 UNTIED = {*NO_MATTER, "threads", "pictures", "strict"}  # what a row's settings do not tell, as its numbers do not depend on it
 OTHER_BASE = re.compile(r",base=[^,]*")  # in the recipe of a method that starts from another policy than its own
+AS_WORDS = {"converters": {"recipe": str}}  # how pd.read_csv takes a recipe as it stands, such as 7 or None
 OWN = ",partnet"  # behind the recipe of a row on the user's own objects
 
 
@@ -130,13 +131,12 @@ def essence(command: str) -> tuple[str, ...]:
 def check_name(name: str) -> None:
     """Raises PdkitError where data/results/NAME.csv is, or would be, no table of runs."""
     path = DATA / "results" / f"{name}.csv"
-    if name.endswith("_curves") or path.exists() and not set(KEYS) <= set(pd.read_csv(path, nrows=0)):
+    try:
+        others = path.exists() and not set(KEYS) <= set(pd.read_csv(path, nrows=0))
+    except ValueError:  # empty, or no table at all
+        others = True
+    if others or name.endswith("_curves"):
         raise PdkitError(f"Nothing can be recorded as {name}: data/results/{name}.csv is no table of runs; choose another name.")
-
-
-def _read(path: Path) -> pd.DataFrame:
-    """A recorded table; a recipe is its word as it stands, such as 7 or None."""
-    return pd.read_csv(path, converters={"recipe": str})
 
 
 def _on_own_objects(table: pd.DataFrame) -> pd.Series:
@@ -159,14 +159,14 @@ def load(name: str, task: str | None = None) -> tuple[pd.DataFrame, pd.DataFrame
     Raises PdkitError when nothing is recorded.
     """
     path, curves = DATA / "results" / f"{name}.csv", DATA / "results" / f"{name}_curves.csv"
-    every = of_these_objects(_read(path)) if path.exists() else pd.DataFrame(columns=KEYS)
+    every = of_these_objects(pd.read_csv(path, **AS_WORDS)) if path.exists() else pd.DataFrame(columns=KEYS)
     table = every if task is None else every[every.task == task]
     if table.empty:
         known, spec = ", ".join(dict.fromkeys(every.task)), DATA / "sweeps" / f"{name}.toml"
         sweep = f"; `pdkit sweep data/sweeps/{spec.name}` makes them." if spec.exists() else ", and no sweep in data/sweeps makes them."
         others = f", only of {known}." if known else sweep
         raise PdkitError(f"No results {name!r}{f' of {task}' if task else ''} are recorded in data/results{others}")
-    lines = of_these_objects(_read(curves)) if curves.exists() else pd.DataFrame(columns=[*KEYS, "step"])
+    lines = of_these_objects(pd.read_csv(curves, **AS_WORDS)) if curves.exists() else pd.DataFrame(columns=[*KEYS, "step"])
     return table.reset_index(drop=True), lines[lines.task.isin(table.task)].reset_index(drop=True)
 
 
@@ -238,7 +238,7 @@ def _whole(table: pd.DataFrame) -> pd.DataFrame:
 def _merged(path: Path, new: pd.DataFrame) -> pd.DataFrame:
     """The file's rows without those that `new` replaces, then `new`, sorted."""
     if path.exists():
-        old = _read(path)
+        old = pd.read_csv(path, **AS_WORDS)
         mine = new[KEYS].drop_duplicates()
         old = old.merge(mine, on=KEYS, how="left", indicator=True).query("_merge == 'left_only'").drop(columns="_merge")
         columns = list(dict.fromkeys([*old, *new]))

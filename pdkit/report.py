@@ -29,7 +29,7 @@ from .cli import Parser
 from .errors import PdkitError
 from .files import DATA, TEMPORARY, atomic_file, runs_root
 from .plots import Picture, save_small
-from .recorded import KEYS, mixed, of_these_objects, picture_of, settings_of
+from .recorded import AS_WORDS, KEYS, mixed, of_these_objects, picture_of, settings_of
 
 COLUMNS = ["claim", "section", "tasks", "seeds", "measured", "interval", "verdict", "command"]
 VERDICTS = {"reproduced": "what the paper says was found", "partly": "found in part, or not yet with certainty",
@@ -84,7 +84,7 @@ def claim_problems(claims: pd.DataFrame) -> list[str]:
 
 def recorded_tables(folder: Path) -> dict[str, pd.DataFrame]:
     """The recorded tables of a row a run, by name (without the claims, the curves, and what is just being written)."""
-    return {path.stem: _read(path) for path in sorted(folder.glob("*.csv"))
+    return {path.stem: _read(path, **AS_WORDS) for path in sorted(folder.glob("*.csv"))
             if path.stem != "claims" and not path.stem.endswith("_curves") and TEMPORARY not in path.name}
 
 
@@ -106,7 +106,7 @@ def table_problems(name: str, table: pd.DataFrame, folder: Path) -> list[str]:
             found.append(f"{name}.csv has a {column} that is no rate between 0 and 1.")
     curves = folder / f"{name}_curves.csv"
     if curves.exists():
-        known = set(_read(curves)[KEYS].drop_duplicates().itertuples(index=False, name=None))
+        known = set(_read(curves, **AS_WORDS)[KEYS].drop_duplicates().itertuples(index=False, name=None))
         lost = [key for key in table[KEYS].itertuples(index=False, name=None) if key not in known]
         found += [f"{name}_curves.csv has no curve of {' '.join(map(str, key))}." for key in lost]
     return found

@@ -159,21 +159,21 @@ def _runs_by_tasks(scores: Any) -> np.ndarray:
     return scores
 
 
-# The three statistics below take one (runs x tasks) array, or many at once, (..., runs, tasks), with a value for each.
-
 def mean(scores: Any) -> Any:
-    """Mean of all numbers of a (runs x tasks) array."""
+    """Mean of all numbers of a (runs x tasks) array, or of each of many, (..., runs, tasks)."""
     return _runs_by_tasks(scores).mean(axis=(-2, -1))
 
 
 def iqm(scores: Any) -> Any:
-    """Interquartile mean of a (runs x tasks) array: the mean of the middle half of all its numbers."""
+    """Interquartile mean of a (runs x tasks) array: the mean of the middle half of all its numbers; of many, (..., runs, tasks), one each.
+    """
     scores = _runs_by_tasks(scores)
     return scipy_stats.trim_mean(scores.reshape(*scores.shape[:-2], -1), 0.25, axis=-1)
 
 
 def probability_of_improvement(scores: Any, other: Any) -> Any:
-    """Probability that a run of `scores` beats one of `other`, both (runs x tasks), on a random task (ties: half)."""
+    """Probability that a run of `scores` beats one of `other`, both (runs x tasks), on a random task (ties: half); of many, (..., runs,
+    tasks), one each."""
     scores, other = _runs_by_tasks(scores), _runs_by_tasks(other)
     if scores.shape[-1] != other.shape[-1]:
         raise PdkitError(f"Both sides need the same tasks, not {scores.shape[-1]} and {other.shape[-1]}.")
@@ -187,12 +187,16 @@ def stratified_bootstrap(statistic: Callable[..., Any], *scores: Any, seed: int,
 
     Runs are drawn with replacement within each task (the strata), so a task keeps its weight. `seed` is explicit: the
     same call gives the same interval. With fewer than about 5 runs such intervals are too narrow. The statistic is asked once for all
-    repetitions, of (repetitions, runs, tasks), and gives a value for each.
+    repetitions, of (repetitions, runs, tasks), and gives a value for each, as `mean`, `iqm` and `probability_of_improvement` do. Raises
+    PdkitError for one that does not.
     """
     _z(confidence)  # rejects a level outside (0, 1)
     arrays = [_runs_by_tasks(s) for s in scores]
     rng = np.random.default_rng(seed)
     drawn = [rng.integers(len(array), size=(repetitions, *array.shape)) for array in arrays]
     values = statistic(*[np.take_along_axis(array[None], rows, axis=1) for array, rows in zip(arrays, drawn, strict=True)])
+    if np.shape(values) != (repetitions,):
+        raise PdkitError("A statistic that is bootstrapped gives a value for each (runs x tasks) array of (repetitions, runs, tasks): say "
+                         "over which axes, as stats.mean does.")
     low, high = np.quantile(values, [0.5 - confidence / 2, 0.5 + confidence / 2])
     return Interval(float(statistic(*arrays)), float(low), float(high))

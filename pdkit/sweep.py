@@ -102,9 +102,10 @@ def main(argv: list[str]) -> int:
     if args.ray or args.address:
         must_be_installed()
     spec = load_spec(args.spec)
-    jobs, name = make_jobs(spec), args.record or spec.record
+    every, name = make_jobs(spec), args.record or spec.record
+    jobs = every
     for wanted, label in ((args.seeds, "seed"), (args.tasks, "task"), (args.recipes, "recipe")):
-        known = {job.labels[label] for job in jobs}
+        known = {job.labels[label] for job in every}
         for value in wanted or ():
             if value not in known:
                 raise unknown(f"{label} of {spec.path.name}", value, known)
@@ -112,7 +113,7 @@ def main(argv: list[str]) -> int:
     if args.missing:
         jobs = missing(jobs, name)
         if not jobs:
-            print(f"Nothing is missing: data/results/{name}.csv has all of it.")
+            print(f"Nothing of it is missing in data/results/{name}.csv.")
             return 0
     if len(old := outdated(jobs)) > 1:
         raise PdkitError(f"{len(old)} jobs were finished with other values than their methods and profiles, or notebooks, now give; delete "

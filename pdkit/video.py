@@ -6,6 +6,7 @@ and chooses MuJoCo's backend; a lesson that cannot draw prints the sentence it r
 from __future__ import annotations
 
 import base64
+import contextlib
 import functools
 import os
 import subprocess
@@ -113,10 +114,10 @@ def _try_sapien() -> str | None:
 
 def _try_own(spec: TaskSpec) -> str | None:
     try:
-        sim = spec.make(render=True)
-        sim.reset(0)
-        sim.render()
-        sim.close()
+        with contextlib.closing(spec.make(render=True)) as sim:
+            sim.reset(0)
+            if (shape := np.shape(picture := sim.render()))[2:] != (3,):
+                raise TypeError(f"render() gives {type(picture).__name__} of shape {shape}")
     except Exception as error:  # whatever someone's simulator raises
         return (f"No pictures: the simulator of {spec.name} draws none ({type(error).__name__}: {error}); for pictures make(render=True) "
                 "gives one whose render() returns an (H, W, 3) array. Everything else runs the same.")

@@ -126,15 +126,24 @@ def test_of_a_long_sentence_its_end_is_kept(folder, tmp_path):
 @pytest.mark.parametrize("words, refused", [
     ("or StackCube", True), ("or StackCube, the paper's", True), ("TurnFaucet or PushChair", True),
     ("Door, StackCube, or another one that comes with a base policy", False), ("or another task that comes with demonstrations", False),
-    ("Door, StackCube, or Pen (PPO alone): what is compared", False), ("", False)])
+    ("Door, StackCube, or Pen (PPO alone): what is compared", False), ("", False), ("or any, such as Pen", False),
+    ("or None: all", False), ("or StackCube (slower)", True), ("or Pen, or StackCube", True)])
 def test_a_task_is_refused_where_the_comment_names_the_two_that_there_are(words, refused):
     known = nb_cells.parse_parameters(f"task = 'Door'  # {words}")
-    for task, ok in (("Door", True), (words.partition("or ")[2].partition(",")[0], True), ("Hammer", not refused)):
+    named = [word for word in ("StackCube", "TurnFaucet", "PushChair", "Pen") if word in words]
+    for task, ok in (("Door", True), *((word, True) for word in named), ("Hammer", not refused)):
         if ok:
             assert nb_cells.checked("x", known, {"task": task}) == {"task": task}
         else:
             with pytest.raises(PdkitError, match="Unknown task of x 'Hammer'"):
                 nb_cells.checked("x", known, {"task": task})
+
+
+def test_the_lessons_that_have_two_tasks_alone():
+    paths = sorted(nb.NOTEBOOKS.glob("*.ipynb"))
+    tasks = {path.stem[:2]: nb_cells._tasks(known["task"]) for path in paths if "task" in (known := nb_cells.parameters_of(path))}
+    assert {name for name, own in tasks.items() if own == {"Door", "StackCube"}} == {"06", "07", "08", "09", "10", "11", "13"}
+    assert tasks["14"] == {"TurnFaucet", "PushChair"} and len(tasks["00"]) == len(tasks["05"]) == len(tasks["16"]) > 8
 
 
 def test_what_fails_after_its_result_has_none_and_does_not_command_the_terminal(folder, tmp_path):

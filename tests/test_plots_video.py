@@ -339,22 +339,26 @@ def test_page_names_a_missing_file(tmp_path):
         page.figure(tmp_path / "a.png")
 
 
-def test_a_simulator_of_ones_own_is_asked_for_a_picture():
+def test_a_simulator_of_ones_own_is_asked_for_a_picture(monkeypatch):
+    monkeypatch.delenv(video.SWITCH, raising=False)
+    closed = []
+
     class Mute:
         def reset(self, seed):
             return np.zeros(2)
 
         def close(self):
-            pass
+            closed.append(self)
 
     class Draws(Mute):
-        def __init__(self, render=False):
+        def __init__(self, render=False, picture=np.zeros((4, 4, 3), np.uint8)):  # noqa: B008
             assert render
-
-        def render(self):
-            return np.zeros((4, 4, 3), np.uint8)
+            self.render = lambda: picture
 
     spec = dataclasses.replace(get_task("Door"), name="mine", suite="mine", make=Mute)
     assert "the simulator of mine draws none (TypeError" in video.try_render(spec)
     assert video.try_render(dataclasses.replace(spec, make=Draws)) is None
     assert "AttributeError" in video.try_render(dataclasses.replace(spec, make=lambda render: Mute()))
+    for picture in (None, np.zeros((4, 4))):
+        assert "TypeError: render() gives" in video.try_render(dataclasses.replace(spec, make=lambda render, p=picture: Draws(render, p)))
+    assert len(closed) == 4

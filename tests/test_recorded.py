@@ -3,7 +3,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from pdkit import recorded
+from pdkit import recorded, report
 from pdkit.errors import PdkitError
 from pdkit.files import read_json, write_json
 from pdkit.sweep_spec import check_names
@@ -149,6 +149,7 @@ def test_a_recipe_is_a_word_whatever_it_looks_like(results, recipe):
         recorded.record("x", rows, rows[recorded.KEYS].assign(step=10))
         assert recipe in recorded.load("x")[0].recipe.tolist()
     assert all(sorted(table.recipe) == sorted(["other", recipe]) for table in recorded.load("x"))
+    assert report.table_problems("x", report.recorded_tables(results)["x"], results) == []
 
 
 def test_only_tables_of_runs_can_be_recorded_in(results):
@@ -156,6 +157,7 @@ def test_only_tables_of_runs_can_be_recorded_in(results):
         pd.DataFrame(columns=columns).to_csv(results / f"{name}.csv", index=False)
     check_names("runs")
     check_names("new")
-    for name in ("claims", "runs_curves"):
+    (results / "empty.csv").touch()
+    for name in ("claims", "runs_curves", "empty"):
         with pytest.raises(PdkitError, match=f"{name}.csv is no table of runs"):
             check_names(name)

@@ -143,6 +143,21 @@ def test_bootstrap_is_seeded_stratified_and_about_right():
     )
 
 
+def test_a_statistic_that_makes_one_number_of_all_repetitions_is_refused():
+    """Its interval would have no width."""
+    for statistic in (np.mean, lambda scores: np.median(scores, axis=-1)):
+        with pytest.raises(PdkitError, match="over which axes"):
+            stats.stratified_bootstrap(statistic, np.arange(6.0).reshape(3, 2), seed=0)
+
+
+def test_many_arrays_at_once_give_what_each_gives():
+    first, second = np.random.default_rng(0).random((2, 7, 5, 3))
+    for statistic in (stats.mean, stats.iqm):
+        assert statistic(first) == pytest.approx([statistic(one) for one in first])
+    assert stats.probability_of_improvement(first, second) == pytest.approx(
+        [stats.probability_of_improvement(*pair) for pair in zip(first, second, strict=True)])
+
+
 def test_bad_scores_are_refused():
     for bad in ([1, 2], [[1, np.nan]], np.zeros((0, 2))):
         with pytest.raises(PdkitError, match="runs x tasks"):

@@ -471,7 +471,7 @@ def test_missing_leaves_out_what_is_recorded_by_the_same_command_alone(tmp_path,
     capsys.readouterr()
     for words in ([], ["--dry-run"]):
         assert cli.main(["sweep", str(path), "--record", "tiny", "--missing", *words]) == 0
-        assert capsys.readouterr().out == "Nothing is missing: data/results/tiny.csv has all of it.\n" and started == [second]
+        assert capsys.readouterr().out == "Nothing of it is missing in data/results/tiny.csv.\n" and started == [second]
 
 
 def test_rows_whose_settings_have_changed_since_are_missing(tmp_path, results):

@@ -18,7 +18,7 @@ from pdkit import cli, imitate, report, train, train_base, train_decorated
 from pdkit.decorated import load_decorated
 from pdkit.demos import load_demos, save_demos
 from pdkit.errors import PdkitError
-from pdkit.files import DATA, locked
+from pdkit.files import DATA, locked, read_json, write_json
 from pdkit.imitate import Saved
 from pdkit.policies import POLICIES, BeT, load_policy
 from pdkit.policies.base import read_card
@@ -182,6 +182,11 @@ def test_training_from_the_command_line_records_a_row_a_seed(monkeypatch, tmp_pa
     capsys.readouterr()
     assert call(monkeypatch, *words) == 0  # finished already: the same row, not a second one
     assert "Trained already" in capsys.readouterr().out
+    path = tmp_path / "runs" / "train" / "Door-smoke-seed0" / "manifest.json"
+    older = read_json(path)
+    del older["parameters"]["success_tail"]  # a field that is newer than the run
+    write_json(path, older)
+    assert call(monkeypatch, *words) == 0 and "Trained already" in capsys.readouterr().out
     table = pd.read_csv(tmp_path / "results" / "t.csv")
     assert len(table) == 1 and table.env_steps[0] >= 600 and table.command[0].startswith("pdkit train decorated Door --profile smoke")
     assert (tmp_path / "results" / "t.png").stat().st_size > 1000

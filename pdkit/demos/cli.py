@@ -98,8 +98,9 @@ def _make(args, source: str) -> Demos:
 
     folder = Path(args.policy) if args.policy else DATA / "checkpoints" / args.task / "decorated"
     if not args.policy and not folder.exists():
-        raise PdkitError(f"Nobody here can demonstrate {args.task}: the kit has neither an expert nor a decorated policy of it; name one "
-                         "with --policy, or make a file of episodes by pdkit.demos.from_episodes and save_demos.")
+        others = ", use --source scripted" * (args.task in EXPERTS)
+        raise PdkitError(f"The kit has no decorated policy of {args.task} that could demonstrate it: name one with --policy{others}, or "
+                         "make a file of your own episodes by pdkit.demos.from_episodes and save_demos.")
     first = 3_000_000 if args.first_seed is None else args.first_seed
     command = f"pdkit demos {args.task} --source agent --num {args.num} --noise {args.noise} --tail {args.tail} --first-seed {first}"
     command += f" --policy {shlex.quote(args.policy)}" if args.policy else ""

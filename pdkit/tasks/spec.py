@@ -30,7 +30,7 @@ class Sim(Protocol):
 
 @dataclass(frozen=True)
 class TaskSpec:
-    """A task of the paper (appendix A, Tables 2 and 3) as it runs here."""
+    """A task as it runs here: of the paper (appendix A, Tables 2 and 3), or of your own."""
 
     name: str
     suite: str  # "adroit" (MuJoCo, gymnasium-robotics) or "maniskill" (SAPIEN), or a word of your own
