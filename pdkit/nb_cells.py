@@ -152,18 +152,19 @@ def checked(notebook: str, known: dict[str, Parameter], given: dict[str, Any]) -
         values[name] = _fit(_plain(value), known[name])
     if values.get("profile", PROFILES[0]) not in PROFILES:
         raise unknown("profile", values["profile"], PROFILES)
-    if "task" in values and values["task"] not in (tasks := _tasks(known["task"])):
+    if "task" in values and (tasks := _tasks(known["task"])) and values["task"] not in tasks:
         raise unknown(f"task of {notebook}", values["task"], tasks)
     return values
 
 
 def _tasks(parameter: Parameter) -> set[str]:
-    """The tasks that a notebook has by the comment of its `task` ("or StackCube, the paper's"): all where it names no second one so."""
+    """The tasks that a notebook has by the comment of its `task` ("or StackCube, the paper's"); empty where that names no second one so:
+    then it may be any, also one that the notebook itself adds."""
     from .tasks import TASKS
 
     begins = ONLY.match(parameter.help)
     if not begins or begins[2] not in TASKS:
-        return set(TASKS)
+        return set()
     return {parameter.default, *(set(re.findall(r"\w+", parameter.help)) & set(TASKS))}
 
 
