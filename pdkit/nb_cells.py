@@ -19,6 +19,7 @@ PROFILES = ("smoke", "lesson", "paper")
 REQUIRED = ("profile", "out")  # parameters that every notebook has
 MAX_CELLS, MAX_LINES = 35, 40
 ONLY = re.compile(r"(\w+ )?or (\w+)( ?[,:;(]|$)")  # how the comment of a `task` begins that can only be one of the tasks which it names
+SOME = "at least one"  # what the comment of a list says that may not be empty
 KINDS = {kind.__name__: kind for kind in (bool, int, float, str, list, dict)}
 
 
@@ -190,6 +191,8 @@ def _fit(value: Any, parameter: Parameter) -> Any:
         wanted = parameter.kind.__name__ + (" or None" if parameter.optional else "")
         raise PdkitError(f"Parameter {parameter.name} must be {wanted}, as its default {parameter.default!r} is; "
                          f"got {value!r}.")
+    if parameter.kind is list and not value and SOME in parameter.help:
+        raise PdkitError(f"Parameter {parameter.name} takes {SOME} entry, such as {parameter.default!r}.")
     kinds = {type(item) for item in parameter.default} if parameter.kind is list and parameter.default else set()
     if len(kinds) == 1:
         item_kind = kinds.pop()

@@ -139,6 +139,13 @@ def test_a_task_is_refused_where_the_comment_names_the_two_that_there_are(words,
                 nb_cells.checked("x", known, {"task": task})
 
 
+def test_a_list_that_says_so_may_not_be_empty():
+    known = nb_cells.parse_parameters("ks = [1, 5]  # numbers of neighbours, at least one\nshow = [1]  # tasks to draw")
+    assert nb_cells.checked("x", known, {"ks": [3], "show": []}) == {"ks": [3], "show": []}
+    with pytest.raises(PdkitError, match=r"Parameter ks takes at least one entry, such as \[1, 5\]\."):
+        nb_cells.checked("x", known, {"ks": []})
+
+
 def test_the_lessons_that_have_two_tasks_alone():
     paths = sorted(nb.NOTEBOOKS.glob("*.ipynb"))
     tasks = {path.stem[:2]: nb_cells._tasks(known["task"]) for path in paths if "task" in (known := nb_cells.parameters_of(path))}
