@@ -160,7 +160,7 @@ def test_same_seed_and_actions_repeat_whatever_came_before(fast):
 
 
 def test_a_later_evaluation_builds_no_scene_and_gives_the_same(monkeypatch):
-    """In what the first left behind, with other pushes in between: a scene takes longer to build than an episode to run."""
+    """In what the first left behind, with other pushes in between."""
     spec, built, moved = get_task("PushChairSource"), [], []
     monkeypatch.setattr("pdkit.tasks.chair.make_chair_env", lambda *words: built.append(words) or make_chair_env(*words))
     actions = pushing(PushChair("source"), 1, steps=60)

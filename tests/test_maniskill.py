@@ -1,6 +1,7 @@
 """The fast ManiSkill step against the stock environment, repeatability, and machines without Vulkan."""
 from __future__ import annotations
 
+import gc
 import hashlib
 import json
 import os
@@ -188,6 +189,16 @@ print(json.dumps(result))
 def digest(sim) -> str:
     """A checksum over an episode with contacts."""
     return hashlib.sha256(play(sim, 1, busy_actions(sim, 1))[0].tobytes()).hexdigest()
+
+
+def test_a_scene_is_built_without_a_search_through_all_that_is_loaded(fast, monkeypatch):
+    """ManiSkill searches for garbage when it builds one: 0.3 s among the objects of torch, 0.02 s among those of the scene."""
+    spared, search = [], gc.collect
+    monkeypatch.setattr(gc, "collect", lambda *words: spared.append(gc.get_freeze_count()) or search(*words))
+    loaded = len(gc.get_objects())
+    StackCube().close()
+    assert spared and min(spared) > loaded * 0.9
+    assert gc.get_freeze_count() == 0
 
 
 def test_without_vulkan_in_another_process(fast):

@@ -20,7 +20,7 @@ from .chair_assets import Chair, chairs
 from .chair_body import HZ, chair_start, solved
 from .chair_plan import plan
 from .maniskill import renew_physics
-from .maniskill_headless import Camera, make_env, quiet
+from .maniskill_headless import Camera, close_env, make_env, quiet
 from .mobile_panda import CONTROL, MobilePanda
 from .spec import TaskSpec
 
@@ -40,7 +40,7 @@ class PushChair:
     With `cameras` the scenes can be drawn by pdkit/pixels (`render` draws plans of the floor, without a scene).
     """
 
-    slow_to_build = True  # a scene takes longer than an episode: lanes keep it when they are closed
+    slow_to_build = True  # a scene takes as long as some tens of steps: lanes keep it when they are closed
 
     def __init__(self, kind: str, render: bool = False, cameras: bool = False):
         self._can_render, self._cameras = render, cameras
@@ -78,7 +78,7 @@ class PushChair:
 
     def close(self) -> None:
         for env, _ in self._scenes.values():
-            env.close()
+            close_env(env)
 
 
 class StockPushChairSource:
@@ -95,7 +95,7 @@ class StockPushChairSource:
         return observation[0].numpy(), bool(info["success"][0])
 
     def close(self) -> None:
-        self._env.close()
+        close_env(self._env)
 
 
 _COMMON = dict(

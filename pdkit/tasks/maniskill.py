@@ -17,7 +17,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from ..errors import PdkitError
-from .maniskill_headless import Camera, make_env, without_materials
+from .maniskill_headless import Camera, close_env, make_env, without_materials
 from .panda import Panda
 
 BASE_POSE = slice(18, 25)  # where the base pose is put back: after 9 joint positions and 9 joint velocities
@@ -34,7 +34,7 @@ class FastSim:
     env_id: ClassVar[str]
     control: ClassVar[str]  # ManiSkill's name of the control mode
     camera: ClassVar[Camera]  # where the camera is and what it looks at, metres
-    slow_to_build: ClassVar[bool] = True  # as long as some hundred steps take: lanes keep it when they are closed
+    slow_to_build: ClassVar[bool] = True  # as long as some tens of steps take: lanes keep it when they are closed
 
     def __init__(self, render: bool = False):
         self._env = self.build(render)
@@ -62,7 +62,7 @@ class FastSim:
         return _picture(self._env, self._can_render)
 
     def close(self) -> None:
-        self._env.close()
+        close_env(self._env)
 
 
 class StockSim:
@@ -90,7 +90,7 @@ class StockSim:
         return _picture(self._env, self._can_render)
 
     def close(self) -> None:
-        self._env.close()
+        close_env(self._env)
 
 
 def with_base_pose(env: Any, observations: Any) -> np.ndarray:
