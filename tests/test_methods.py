@@ -185,6 +185,29 @@ def test_the_papers_rlpd_adds_layer_norm_and_demonstrations_to_fine_tuning(profi
     assert (ours.sac.num_critics, ours.sac.target_subset, ours.utd) == (2, 0, plain.utd)
 
 
+CALQL = dict(calql_offline_updates=20_000, calql_actions=10, calql_weight=1.0, calql_max_target=True)
+
+
+@pytest.mark.parametrize("method, numbers", [  # facts.md 3.1 to 3.7, 4.2; appendix B.5
+    ("jsrl", dict(jsrl_step=10, jsrl_episodes=100)),
+    ("rot", dict(ot_epsilon=0.01, ot_iterations=100, ot_total=10.0, ot_trunk=50, ot_renew_every=10_000, bc_weight=0.03)),
+    ("fish", dict(ot_epsilon=0.01, ot_iterations=100, ot_total=10.0, bc_weight=0.03, alpha=0.2, H=0, critic_input="concat",
+                  actor_input="obs+base")),
+    ("calql", CALQL), ("calql_d", CALQL),
+    ("calql_a", CALQL | dict(actor_lr=1e-4, critic_lr=3e-4, tau=0.005, gamma=0.99, batch=256, utd=1.0, hidden=512, demo_fraction=0.5,
+                             on_success="terminate")),
+    ("rlpd", dict(utd=20.0, num_critics=10, target_subset=2, layers=3, hidden=256, entropy_backup=False, batch=256, actor_lr=3e-4,
+                  critic_lr=3e-4, tau=0.005, gamma=0.99, warmup_steps=5_000, target_entropy_scale=0.5, init_temperature=1.0,
+                  total_steps=1_000_000, demo_fraction=0.5, critic_layer_norm=True)),
+    ("ppo_finetune", dict(ppo_clip=0.2, ppo_gae_lambda=0.95, ppo_epochs=10, ppo_minibatches=32, ppo_lr=3e-4, ppo_value_coef=0.5,
+                          ppo_entropy_coef=0.0, ppo_grad_clip=0.5)),
+    ("dipo", dict(dipo_steps=20, dipo_lr=0.03, dipo_norm=0.1)),
+    ("residual_rl", dict(alpha=1.0, alpha_scale=[], H=0)), ("sac_from_scratch", dict(demo_fraction=0.0))])
+def test_the_paper_profile_has_the_numbers_of_its_sources(method, numbers):
+    values = flat(method_config(method, "Door", "paper"))
+    assert {name: values[name] for name in numbers} == numbers
+
+
 @pytest.mark.parametrize("method", ["sac_finetune", "rlpd_paper"])
 def test_fine_tuning_learns_and_leaves_the_start_alone(bet_sac, method):
     """It starts with the spread that small actors start with: with its own, a quarter of that, one seed of six hardly meets a reward."""
