@@ -6,22 +6,17 @@ import fcntl
 import hashlib
 import itertools
 import json
-import re
 import shlex
 import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-import matplotlib.pyplot as plt
 import pandas as pd
-from matplotlib.figure import Figure
 
 from .errors import PdkitError
 from .files import DATA, atomic_file, read_json, write_json
-from .plots import PALETTE, save_small
 from .runs import NO_MATTER, describe_machine
-from .stats import wilson
 from .tasks import TASKS
 from .tasks.partnet import object_set
 
@@ -30,7 +25,6 @@ CLOCK = ["seconds", "eval_seconds"]  # of a run's curve: another machine's, and 
 TRAINING = "pdkit train decorated"  # how a command that makes a row of a training begins
 SETTINGS = "settings"  # the column that tells rows of other settings apart: a `mark`, whose settings the manifest holds
 UNTIED = {*NO_MATTER, "threads", "pictures", "strict"}  # what a row's settings do not tell, as its numbers do not depend on it
-OTHER_BASE = re.compile(r",base=[^,]*")  # in the recipe of a method that starts from another policy than its own
 AS_WORDS = {"converters": {"recipe": str}}  # how pd.read_csv takes a recipe as it stands, such as 7 or None
 OWN = ",partnet"  # behind the recipe of a row on the user's own objects
 
@@ -67,6 +61,9 @@ def record(name: str, rows: pd.DataFrame, curves: pd.DataFrame, settings: Mappin
                    | ({SETTINGS: known} if known else {}))
         if len(tables) < 2 or not {"base_success", "decorated_success"} <= set(tables[0]):
             return
+        from .plots import save_small  # matplotlib, which a training has no other need of
+        from .plots_recorded import figure
+
         for task in dict.fromkeys(tables[0].task):  # all: which is the first may have changed
             with atomic_file(folder / f"{picture_of(name, task, tables[0])}.png") as temporary:
                 save_small(figure(*tables, task), temporary)
@@ -246,63 +243,3 @@ def _merged(path: Path, new: pd.DataFrame) -> pd.DataFrame:
         parts = [part.dropna(axis=1, how="all") for part in (old, new) if len(part)]
         new = pd.concat(parts, ignore_index=True).reindex(columns=columns)
     return new.sort_values([*KEYS, *(["step"] if "step" in new else [])], ignore_index=True)
-
-
-def figure(table: pd.DataFrame, curves: pd.DataFrame, task: str = "Door") -> Figure:
-    """Left: evaluations on selection seeds during training, a line a run. Right: success on the test seeds, with intervals.
-
-    Runs are named by their recipe where there are several recipes, by their seed otherwise; several recipes with several seeds
-    are a line a recipe (the mean), and a bar with a dot a seed, the best on top; what starts from another policy (`,base=`) has its
-    method's colour, dashed and hatched. Where recipes start from different successes of one
-    kind of policy, which then has no bar of its own, each of their bars has a tick at its start.
-    """
-    table, curves = table[table.task == task], curves[curves.task == task]
-    recipes, several = list(dict.fromkeys(table.recipe)), table.recipe.nunique() > 1
-    means = several and len(table) > len(recipes)
-    if means:
-        recipes = list(table.groupby("recipe", sort=False).decorated_success.mean().sort_values(ascending=False, kind="stable").index)
-    height = max(4.4 if several else 3.6, 0.22 * (len(recipes) if means else len(table)))
-    fig, (left, right) = plt.subplots(1, 2, figsize=(10, height), width_ratios=(3, 2), layout="constrained")
-    methods = list(dict.fromkeys(OTHER_BASE.sub("", recipe) for recipe in recipes))
-    groups = [(r, r, table[table.recipe == r]) for r in recipes] if means else \
-        [(f"{r.recipe}, seed {r.seed}" if several else f"seed {r.seed}", r.recipe, table.loc[[i]]) for i, r in table.iterrows()]
-    kind_of = "policy" if "policy" in table else "task"
-    kinds = table.groupby(kind_of, sort=False).base_success
-    bases = {f"base ({kind})" if len(kinds) > 1 else "base": starts.iloc[0] for kind, starts in kinds if starts.nunique() == 1}
-    scattered = {kind for kind, starts in kinds if starts.nunique() > 1}
-    ticks = {name: rows.base_success.mean() for name, _, rows in groups if rows[kind_of].iloc[0] in scattered}
-    bars = [(name, [value], "0.65", table.episodes.iloc[0]) for name, value in bases.items()]
-    for i, (name, recipe, rows) in enumerate(groups):
-        color = PALETTE[(methods.index(OTHER_BASE.sub("", recipe)) if several else i) % len(PALETTE)]
-        curve = curves[(curves.recipe == recipe) & curves.seed.isin(rows.seed)].reindex(columns=["seed", "step", "success_once"]).dropna()
-        # Seeds are logged a few steps apart: the n-th evaluations belong together.
-        curve = curve.assign(number=curve.groupby("seed").cumcount()).groupby("number")[["step", "success_once"]].mean()
-        left.plot(curve.step / 1000, 100 * curve.success_once, "--o" if OTHER_BASE.search(recipe) else "-o", ms=3, lw=1.2, color=color,
-                  label=name)
-        bars.append((name, list(rows.decorated_success), color if several else "#2c9f6b", rows.episodes.iloc[0]))
-    for value in bases.values():
-        left.axhline(100 * value, color="0.4", ls="--", lw=1, label="base policy")
-    left.set(xlabel="environment steps (thousands)", ylabel="success within the episode (%)", ylim=(0, 102),
-             title=f"{task}: evaluations during training")
-    if not several:
-        left.legend(fontsize=8, loc="lower right")
-    for y, (name, values, color, count) in enumerate(reversed(bars)):
-        value = sum(values) / len(values)
-        right.barh(y, 100 * value, color=color, hatch="///" if OTHER_BASE.search(name) else "", edgecolor="white", lw=0)
-        right.plot(0, y, "s", ms=6, color=color, clip_on=False)  # bars of 0 have a colour, too
-        if means and name not in bases:
-            right.plot([100 * v for v in values], [y] * len(values), "k.", ms=4)
-        else:
-            rate = wilson(round(value * count), int(count))
-            right.errorbar(100 * value, y, xerr=[[100 * (value - rate.low)], [100 * (rate.high - value)]], color="k", capsize=3, lw=1)
-        if name in ticks:
-            right.plot([100 * ticks[name]] * 2, [y - 0.4, y + 0.4], color="0.4", lw=2)
-        right.text(104, y, f"{100 * value:.3g}", va="center", fontsize=8)
-    right.set_yticks(range(len(bars)), [name for name, *_ in reversed(bars)], fontsize=8)
-    least, most = int(table.episodes.min()), int(table.episodes.max())
-    shown = f"{least if least == most else f'{least} to {most}'} test episodes, {'mean and seeds' if means else '95 % intervals'}"
-    right.set(xlabel="success within the episode (%)", xlim=(0, 102), title=f"{shown}\n(grey: its start)" if ticks else shown)
-    for ax in (left, right):
-        ax.spines[["top", "right"]].set_visible(False)
-    plt.close(fig)
-    return fig

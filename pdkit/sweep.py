@@ -8,9 +8,9 @@ from collections.abc import Iterator, Sequence
 
 from . import nb
 from .cli import Parser
+from .durations import duration
 from .errors import PdkitError, unknown
 from .files import ROOT, locked, runs_root
-from .main_job import duration
 from .sweep_jobs import OF_BASE, bases_to_make, finished, make_jobs, missing, outdated, unlike_recorded
 from .sweep_progress import Progress
 from .sweep_ray import Ray, must_be_installed

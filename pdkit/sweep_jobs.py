@@ -11,10 +11,10 @@ from typing import Any
 
 from . import nb
 from .demos import Demos, sources
+from .durations import evaluation_minutes, expected_minutes
 from .errors import PdkitError
 from .files import ROOT, read_json, runs_root
 from .imitate import ImitateConfig, configured, untrained
-from .main_job import evaluation_minutes, expected_minutes
 from .methods.registry import base_folder, method_config, trainer_of
 from .nb_cells import notebook_checksum, parameters_of
 from .policies import Policy, load_policy

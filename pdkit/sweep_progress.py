@@ -5,7 +5,7 @@ import sys
 import time
 from collections.abc import Sequence
 
-from .main_job import duration
+from .durations import duration
 from .nb import Line
 from .sweep_run import Job
 

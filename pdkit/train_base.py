@@ -12,11 +12,11 @@ from typing import Any
 from .cli import parse_settings
 from .demos import Demos, sources
 from .demos.cli import Progress
+from .durations import duration
 from .errors import PdkitError
 from .evaluate import outcome, reported
 from .files import check_replaceable, discard, runs_root, write_json
 from .imitate import Diverged, ImitateConfig, configured, imitate
-from .main_job import duration
 from .pixels.cameras import view_of
 from .pixels.learn import check_pixels, imitate_pixels, look_up, visual_settings
 from .pixels.pictures import pictures_of

@@ -9,9 +9,10 @@ import nbformat
 import pytest
 
 from pdkit import check, main_job, nb, stats, unlearning
+from pdkit.durations import duration, expected_minutes
 from pdkit.errors import PdkitError
 from pdkit.files import DATA, ROOT, read_json
-from pdkit.main_job import configured, expected_minutes
+from pdkit.main_job import configured
 from pdkit.methods.registry import method_config
 from pdkit.tasks import get_task
 from pdkit.video import try_render
@@ -354,7 +355,7 @@ def test_announced_times_follow_the_budget():
 
     assert minutes("smoke") < minutes("lesson") < minutes("lesson", total_steps=200_000) < minutes("paper")
     assert 2 < minutes("lesson") < 20 and 300 < minutes("paper") < 3000
-    assert main_job.duration(5.2) == "about 5 minutes" and main_job.duration(600) == "about 10 hours"
+    assert duration(5.2) == "about 5 minutes" and duration(600) == "about 10 hours"
 
 
 # ---- exercises -------------------------------------------------------------------------------------------------------

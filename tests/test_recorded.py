@@ -6,6 +6,7 @@ import pytest
 from pdkit import recorded, report
 from pdkit.errors import PdkitError
 from pdkit.files import read_json, write_json
+from pdkit.plots_recorded import figure
 from pdkit.sweep_spec import check_names
 
 
@@ -59,7 +60,7 @@ def test_the_picture_shows_every_policy_that_methods_start_from():
     curves = rows[["task", "recipe", "seed"]].assign(step=1_000, success_once=0.6)
     for table, expected in ((rows, {"base (bet)": 0.5, "base (vinn)": 0.9, "a": 0.75, "b": 0.15}),
                             (rows[rows.recipe == "a"].assign(recipe=["x", "y"]), {"base": 0.5})):
-        left, right = recorded.figure(table, curves[curves.recipe.isin(table.recipe)]).axes
+        left, right = figure(table, curves[curves.recipe.isin(table.recipe)]).axes
         names = [label.get_text() for label in right.get_yticklabels()]
         widths = {names[round(bar.get_y() + bar.get_height() / 2)]: bar.get_width() / 100 for bar in right.patches}
         assert {name: widths[name] for name in expected} == pytest.approx(expected)
@@ -71,7 +72,7 @@ def test_recipes_that_start_from_different_successes_show_each_its_own():
     """As over several horizons: the first one's would stand for all."""
     rows = pd.DataFrame({"task": "Door", "recipe": ["a", "a", "b", "b"], "policy": "bet", "seed": [0, 1, 0, 1], "episodes": 60,
                          "base_success": [0.5, 0.5, 0.9, 0.9], "decorated_success": [0.7, 0.8, 0.1, 0.2]})
-    left, right = recorded.figure(rows, rows[["task", "recipe", "seed"]].assign(step=1_000, success_once=0.6)).axes
+    left, right = figure(rows, rows[["task", "recipe", "seed"]].assign(step=1_000, success_once=0.6)).axes
     names = [label.get_text() for label in right.get_yticklabels()]
     ticks = {names[round(sum(line.get_ydata()) / 2)]: line.get_xdata()[0] / 100 for line in right.lines if line.get_color() == "0.4"}
     assert ticks == {"a": 0.5, "b": 0.9} and names == ["b", "a"]  # from below: the better one is on top
@@ -82,7 +83,7 @@ def test_only_recipes_whose_kind_of_policy_has_several_starts_have_ticks():
     """A method from scratch has the row of the base that it was given: a tick there would call that its start."""
     rows = pd.DataFrame({"task": "Door", "recipe": ["a", "b", "c", "sac_from_scratch"] * 2, "policy": ["vinn", "vinn", "bet", "bet"] * 2,
                          "seed": [0] * 4 + [1] * 4, "episodes": 60, "base_success": [0.9, 0.8, 0.5, 0.5] * 2, "decorated_success": 0.7})
-    right = recorded.figure(rows, rows[["task", "recipe", "seed"]].assign(step=1_000, success_once=0.6)).axes[1]
+    right = figure(rows, rows[["task", "recipe", "seed"]].assign(step=1_000, success_once=0.6)).axes[1]
     names = [label.get_text() for label in right.get_yticklabels()]
     ticks = {names[round(sum(line.get_ydata()) / 2)]: line.get_xdata()[0] / 100 for line in right.lines if line.get_color() == "0.4"}
     assert ticks == {"a": 0.9, "b": 0.8} and "base (bet)" in names and "base (vinn)" not in names
@@ -125,7 +126,7 @@ def test_counts_are_kept_to_the_last_digit_where_some_rows_lack_them(results):
 def test_runs_without_evaluations_can_be_drawn():
     table = pd.DataFrame([{"task": "Door", "recipe": "x", "seed": s, "base_success": 0.5, "decorated_success": 0.6, "episodes": n}
                           for s, n in ((0, 1_000), (1, 20))])
-    left, right = recorded.figure(table, table[["task", "recipe", "seed"]].assign(step=10)).axes
+    left, right = figure(table, table[["task", "recipe", "seed"]].assign(step=10)).axes
     assert "20 to 1000 test episodes" in right.get_title() and not any(len(line.get_xdata()) > 2 for line in left.lines)
     widths = {round(float(np.ptp(segment[:, 0])), 1) for bars in right.collections for segment in bars.get_segments()}
     assert {6.1, 39.5} <= widths  # Wilson's of 600 of 1,000 and of 12 of 20

@@ -18,9 +18,9 @@ from sweep_jobs import job, play
 
 from pdkit import cli, nb, profiles, recorded, report, sweep, sweep_jobs, sweep_ray, sweep_run
 from pdkit.demos.sources import bundled
+from pdkit.durations import evaluation_minutes, expected_minutes
 from pdkit.errors import PdkitError
 from pdkit.files import DATA, ROOT, read_json, write_json
-from pdkit.main_job import evaluation_minutes, expected_minutes
 from pdkit.methods.registry import method_config
 from pdkit.policies import load_policy
 from pdkit.policies.base import read_card
