@@ -868,11 +868,14 @@ def test_most_seeds_of_door_reach_nearly_all(results, ends, verdict):
     assert found.verdict == verdict and found.tasks == "Door" and found.measured.startswith(f"{ends.count(0.96)} of {len(ends)} seeds")
 
 
-def test_a_warm_start_lasts_as_long_as_two_evaluations_are_apart():
-    jobs = make_jobs(load_spec(DATA / "sweeps" / "warm_finetuning.toml"))
-    waits = {job.labels["recipe"]: (job.config["critic_warmup"], job.config["eval_every"] * job.config["utd"]) for job in jobs}
-    assert waits["warm-fixed"] == waits["warm-learned"] == (verdicts.failures.WARM_UPDATES, verdicts.failures.WARM_UPDATES)
-    assert waits["vanilla"][0] == 0
+def test_a_warm_start_lasts_a_whole_number_of_evaluations_and_what_is_compared_learns_alike():
+    for name in ("warm_finetuning", "warm_finetuning_stackcube"):
+        jobs = {job.labels["recipe"]: job.config for job in make_jobs(load_spec(DATA / "sweeps" / f"{name}.toml"))}
+        waits = {recipe: config["critic_warmup"] for recipe, config in jobs.items()}
+        assert waits == {"vanilla": 0, "warm-fixed": verdicts.failures.WARM_UPDATES, "warm-learned": verdicts.failures.WARM_UPDATES}
+        for config in jobs.values():
+            between = config["eval_every"] * config["utd"]
+            assert verdicts.failures.WARM_UPDATES % between == 0 and between > 100 and config["lr_decay_from"] == 1.0
 
 
 # ---- the horizon -----------------------------------------------------------------------------------------------------

@@ -323,7 +323,7 @@ def _() -> Finding:
                    jointly(judged_over_tasks(rises, np.log2(RISES)), judged_over_tasks(loss, np.log2(EXPLODES))))
 
 
-WARM_UPDATES = 625  # of data/sweeps/warm_finetuning.toml: the distance of two evaluations, so that both arms meet at equal ages
+WARM_UPDATES = 625  # of data/sweeps/warm_finetuning.toml: five times the distance of two evaluations, so that both arms meet at equal ages
 
 
 @measures("Fine-tuning without a warm start outperforms")
