@@ -26,7 +26,7 @@ from ..errors import PdkitError
 from ..files import atomic_folder, read_json, runs_root, sha256
 from ..tasks import get_task
 from ..tasks.maniskill import building
-from ..tasks.maniskill_headless import make_env, quiet
+from ..tasks.maniskill_headless import close_env, make_env, quiet
 from ..tasks.spec import Sim, TaskSpec
 from .format import Demos, from_episodes
 
@@ -204,7 +204,7 @@ def _executed(spec: TaskSpec, path: Path, episodes: list[Recorded]) -> Iterator[
                     followed.step(action)
             yield followed.episode(spec.max_episode_steps)
     finally:
-        original.close()
+        close_env(original)
         sim.close()
 
 

@@ -7,12 +7,13 @@ while an environment is built. Physics is untouched, so the trajectories are the
 from __future__ import annotations
 
 import gc
+import itertools
 import logging
 import subprocess
 import sys
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from functools import lru_cache
 from typing import Any
 
@@ -20,6 +21,7 @@ from ..errors import PdkitError
 from ..machine import SAPIEN_DRAWS
 
 PICTURE = 256  # pixels a side of a rendered frame
+_closings = itertools.count(1)
 
 
 class _Inert:
@@ -73,17 +75,25 @@ def quiet() -> Iterator[None]:
             logger.setLevel(level)
 
 
+class _Young:
+    """Stands in for `gc` where ManiSkill calls for a collection."""
+
+    @staticmethod
+    def collect() -> int:
+        return gc.collect(1)
+
+
 @contextmanager
-def collecting_little() -> Iterator[None]:
-    """Within this block what is there already is no garbage to be looked for. ManiSkill has it looked for whenever it builds or closes a
-    scene, which frees memory of a GPU; among the half million objects of torch and its like that is nine tenths of the time of either."""
-    frozen = gc.get_freeze_count()
-    gc.freeze()
+def collecting_young() -> Iterator[None]:
+    """Within this block ManiSkill searches recent objects alone for garbage. It searches whenever it builds or closes a scene, to free a
+    GPU's memory; among the half million objects of torch and its like that is nine tenths of the time of either."""
+    from mani_skill.envs import sapien_env
+
+    sapien_env.gc = _Young
     try:
         yield
     finally:
-        if not frozen:  # else someone else's, too, would be thawed
-            gc.unfreeze()
+        sapien_env.gc = gc
 
 
 @lru_cache(maxsize=1)
@@ -110,9 +120,12 @@ def require_rendering() -> str:
 
 
 def close_env(env: Any) -> None:
-    """Close an environment of `make_env`."""
-    with collecting_little():
+    """Close an environment of `make_env`. Closed scenes are garbage among old objects (half a megabyte each): one closing in 25 searches
+    these, too."""
+    with nullcontext() if env.render_mode else collecting_young():
         env.close()
+    if next(_closings) % 25 == 0:
+        gc.collect()
 
 
 Camera = tuple[tuple[float, float, float], tuple[float, float, float]]  # where it is and what it looks at, metres
@@ -134,7 +147,6 @@ def make_env(env_id: str, control_mode: str, camera: Camera | None = None, **kwa
         if camera:
             view = dict(width=PICTURE, height=PICTURE, pose=look_at(*camera))
             drawing = dict(render_backend=device, render_mode="rgb_array", human_render_camera_configs=view)
-            with collecting_little():
-                return gymnasium.make(env_id, **options, **drawing).unwrapped
-        with without_materials(), collecting_little():
+            return gymnasium.make(env_id, **options, **drawing).unwrapped
+        with without_materials(), collecting_young() if options["sim_backend"] == "cpu" else nullcontext():
             return gymnasium.make(env_id, render_backend="none", **options).unwrapped
