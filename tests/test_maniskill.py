@@ -14,7 +14,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from mani_skill.envs import sapien_env
 
 from pdkit.demos.experts import StackCubeExpert
 from pdkit.errors import PdkitError
@@ -196,6 +195,8 @@ def digest(sim) -> str:
 
 def test_building_and_closing_search_recent_objects_alone_for_garbage(monkeypatch):
     """A search through all that torch and its like have loaded takes 0.3 s, and ManiSkill calls for one at each."""
+    from mani_skill.envs import sapien_env  # not above: another process imports this file and must be silent
+
     searched, search = [], gc.collect
     monkeypatch.setattr("pdkit.tasks.maniskill_headless._closings", itertools.count(1))
     with monkeypatch.context() as patch:
