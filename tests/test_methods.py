@@ -188,7 +188,7 @@ def test_the_papers_rlpd_adds_layer_norm_and_demonstrations_to_fine_tuning(profi
 CALQL = dict(calql_offline_updates=20_000, calql_actions=10, calql_weight=1.0, calql_max_target=True)
 
 
-@pytest.mark.parametrize("method, numbers", [  # facts.md 3.1 to 3.7, 4.2; appendix B.5
+@pytest.mark.parametrize("method, numbers", [  # facts.md 3.1 to 3.7, appendix B.5; PPO: cleanrl
     ("jsrl", dict(jsrl_step=10, jsrl_episodes=100)),
     ("rot", dict(ot_epsilon=0.01, ot_iterations=100, ot_total=10.0, ot_trunk=50, ot_renew_every=10_000, bc_weight=0.03)),
     ("fish", dict(ot_epsilon=0.01, ot_iterations=100, ot_total=10.0, bc_weight=0.03, alpha=0.2, H=0, critic_input="concat",
