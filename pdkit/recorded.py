@@ -32,7 +32,7 @@ OWN = ",partnet"  # behind the recipe of a row on the user's own objects
 def record(name: str, rows: pd.DataFrame, curves: pd.DataFrame, settings: Mapping[str, dict[str, Any]] | None = None) -> None:
     """Add rows to data/results/NAME.csv and, where there are curves, NAME_curves.csv, and draw a picture a task of trainings.
 
-    Numbers keep six significant digits, those of curves four, which have no CLOCK: more than is drawn, and the repository stays small.
+    Numbers keep six significant digits, those of curves three, which have no CLOCK: more than is drawn, and the repository stays small.
 
     `settings` are those of the rows by their mark (column SETTINGS); the manifest keeps them.
 
@@ -45,7 +45,7 @@ def record(name: str, rows: pd.DataFrame, curves: pd.DataFrame, settings: Mappin
     rows, curves = (table.assign(recipe=table.recipe.where(~_on_own_objects(table), table.recipe + OWN)) if len(table) else table
                     for table in (rows, curves.drop(columns=CLOCK, errors="ignore")))
     with _alone():
-        for path, new, digits in ((folder / f"{name}.csv", rows, 6), (folder / f"{name}_curves.csv", curves, 4)):
+        for path, new, digits in ((folder / f"{name}.csv", rows, 6), (folder / f"{name}_curves.csv", curves, 3)):
             if new.empty:
                 continue
             tables.append(_merged(path, new))
