@@ -138,4 +138,4 @@ def test_the_shipped_policies_are_those_of_a_recorded_row(task):
     assert row.env_steps >= online_config(task, "lesson").total_steps
     assert table.base_success.nunique() == 1 and 0.2 <= row.base_success <= 0.8 and (table.episodes == 200).all()
     gains = (table.decorated_success - table.base_success).set_axis(table.seed)
-    assert gains.mean() > 0.15 and gains[gains < 0.1].index.tolist() == ([3] if task == "TurnFaucet" else [])  # which is not improved
+    assert gains.mean() > 0.15 and gains[gains <= 0.1].index.tolist() == ([3] if task == "TurnFaucet" else [])  # which is not improved
