@@ -116,6 +116,12 @@ def test_the_shipped_claims_and_tables_are_right(tmp_path, capsys):
         assert claims.section.str.split(r",\s*").apply(lambda names, s=section: s in names).any(), section
 
 
+def test_the_readme_tells_how_many_claims_hold():
+    held = report.load_claims(DATA / "results" / "claims.csv").verdict.value_counts()
+    told = ", ".join(f"{held[verdict]} {verdict}" for verdict in ("reproduced", "partly", "not", "untested"))
+    assert f"{held.sum()} claims of the paper: {told}," in (DATA.parent / "README.md").read_text().replace("\n  ", " ")
+
+
 def test_the_claim_about_door_says_what_the_recorded_rows_say():
     claim = report.load_claims(DATA / "results" / "claims.csv").set_index("section").loc["Fig. 1"].iloc[0]
     table = pd.read_csv(DATA / "results" / "main_job.csv").query("task == 'Door' and recipe == 'lesson'")
