@@ -1,4 +1,5 @@
-"""Figures of all tasks: from base to decorated policy, beside the paper's averages (notebook 16), and what a bound allows (notebook 13)."""
+"""Figures of all tasks: from base to decorated policy, beside the paper's averages (notebook 16) and beside longer imitation (05); what
+a bound allows (13)."""
 from __future__ import annotations
 
 import matplotlib as mpl
@@ -6,7 +7,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.lines import Line2D
 
-from .plots import COLORS, Picture, _columns, blank, styled
+from .plots import COLORS, PALETTE, Picture, _columns, blank, styled
 from .task_range import PAPER_DIFFUSION, averages
 
 
@@ -56,6 +57,29 @@ def over_diffusion_figure(tasks: pd.DataFrame) -> Picture:
     """The same of `task_range.over_diffusion`."""
     return range_figure(tasks, averages(tasks, {"all": PAPER_DIFFUSION}), "Over a Diffusion Policy, the last policy of a run",
                         "what seem to be six tasks, not named")
+
+
+@styled
+def imitation_figure(tasks: pd.DataFrame, title: str = "") -> Picture:
+    """Rows of `task_range.beside_imitation`: base policy, longer imitation and decorated policy of a task in a line, with intervals."""
+    _columns(tasks, "task", "base", "decorated", "imitated")
+    figure, axes = blank(size=(8.2, 1.3 + 0.42 * len(tasks)))
+    ax, marks = axes[0, 0], []
+    for name, start, marker, color, aside in (("base policy, as it is decorated", "base", "o", COLORS["base"], -0.2),
+                                              ("imitation alone, longer", "imitated", "D", PALETTE[2], 0.0),
+                                              ("decorated", "decorated", "o", COLORS["decorated"], 0.2)):
+        ends = ("low", "high") if start == "decorated" else (f"{start}_low", f"{start}_high")
+        y = np.arange(len(tasks)) + aside
+        ax.hlines(y, tasks[ends[0]], tasks[ends[1]], color=color, lw=5, alpha=0.25, zorder=1)
+        ax.plot(tasks[start], y, marker, ms=6, color=color)
+        marks.append(Line2D([], [], marker=marker, ls="", color=color, label=name))
+    ax.set_yticks(range(len(tasks)), [f"{row.task} ({row.imitated_seeds}; {row.seeds} seeds)" for row in tasks.itertuples()])
+    ax.set(ylim=(len(tasks) - 0.5, -0.5), xlim=(0, 1.03), xlabel="success within the episode", title=title)
+    ax.xaxis.set_major_formatter(mpl.ticker.PercentFormatter(1.0, decimals=0))
+    ax.grid(axis="y", visible=False)
+    marks.append(Line2D([], [], lw=5, alpha=0.8, color=COLORS["recorded"], solid_capstyle="butt", label="95 % interval"))
+    figure.legend(handles=marks, loc="outside lower center", ncols=4, fontsize=8.5)
+    return figure
 
 
 @styled

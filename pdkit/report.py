@@ -9,7 +9,7 @@ data/results/claims.csv has a row a claim:
                                                  command   that makes the numbers again
 
 `pdkit report --update` first computes every verdict anew for which there is a rule (pdkit/verdicts) and enough is recorded, and draws
-all_tasks.png and over_diffusion.png.
+the `pictures` of several records.
 A claim whose verdict is not "untested" has all of them. The recorded tables beside it (a row a run, with its command) are checked
 too: a report on broken tables is refused.
 """
@@ -20,6 +20,7 @@ import sys
 import textwrap
 import tomllib
 from collections import Counter
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import pandas as pd
@@ -167,6 +168,21 @@ def _range(tables: dict[str, pd.DataFrame]) -> Picture:
     return plots_range.range_figure(tasks, task_range.averages(tasks), "Base policies and decorated ones, best evaluation of a run")
 
 
+def pictures(tables: Mapping[str, pd.DataFrame]) -> Iterator[tuple[str, Picture]]:
+    """The pictures of several records, by their names in data/results; those of which nothing is recorded are left out."""
+    def rows(name: str) -> pd.DataFrame:
+        return of_these_objects(tables.get(name, pd.DataFrame(columns=["task", "recipe"])))
+
+    if "main_job" in tables:
+        yield "all_tasks", _range(tables)
+    beside = task_range.beside_imitation(rows("main_job"), rows("longer_imitation"))
+    if len(beside):
+        yield "beside_imitation", plots_range.imitation_figure(beside, "What imitation alone comes to, and what decoration does")
+    sampled = task_range.over_diffusion({name: rows(name) for name in task_range.DIFFUSION})
+    if len(sampled):
+        yield "over_diffusion", plots_range.over_diffusion_figure(sampled)
+
+
 def main(argv: list[str]) -> int:
     """`pdkit report [--update] [--out FILE]`; 1 when something in the claims or the tables is wrong, which is then listed."""
     parser = Parser(prog="pdkit report", description="List the paper's claims with what was measured, and write a page.")
@@ -179,9 +195,6 @@ def main(argv: list[str]) -> int:
         with atomic_file(folder / "claims.csv") as temporary:
             claims.to_csv(temporary, index=False)
     claims, tables = load_claims(folder / "claims.csv"), recorded_tables(folder)
-    if args.update and "main_job" in tables:
-        with atomic_file(folder / "all_tasks.png") as temporary:
-            save_small(_range(tables), temporary)
     problems = claim_problems(claims) + absent_tables(claims, tables)
     for name, table in tables.items():
         problems += table_problems(name, table, folder)
@@ -189,10 +202,9 @@ def main(argv: list[str]) -> int:
         print(*problems, sep="\n", file=sys.stderr)
         return 1
     if args.update:
-        sampled = task_range.over_diffusion({name: of_these_objects(tables[name]) for name in task_range.DIFFUSION if name in tables})
-        if len(sampled):
-            with atomic_file(folder / "over_diffusion.png") as temporary:
-                save_small(plots_range.over_diffusion_figure(sampled), temporary)
+        for name, picture in pictures(tables):
+            with atomic_file(folder / f"{name}.png") as temporary:
+                save_small(picture, temporary)
     out = page.write_page(args.out or runs_root() / "report.html", "Claims of the paper, and what was measured",
                           sections(claims, tables, folder))
     print(*lines(claims), "", sep="\n")

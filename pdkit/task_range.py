@@ -63,6 +63,25 @@ def by_task(table: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows).reindex(columns=COLUMNS)
 
 
+def beside_imitation(jobs: pd.DataFrame, longer: pd.DataFrame) -> pd.DataFrame:
+    """For each task of longer_imitation.csv, what its decorated policies come to beside what imitation alone would have.
+
+    Columns: task, seeds, episodes, base, base_low, base_high, decorated, low, high (of the main job: as in `by_task`), imitated (mean over
+    the seeds of the longer imitation), imitated_low, imitated_high (Student's t), imitated_seeds. Tasks that `jobs` has not are left out.
+    """
+    columns = ["task", "seeds", "episodes", "base", "base_low", "base_high", "decorated", "low", "high", "imitated", "imitated_low",
+               "imitated_high", "imitated_seeds"]
+    rows = []
+    for task in (task for suite in reversed(SUITES) for task in TASKS[suite]):
+        job, alone = jobs[jobs.task == task], longer[longer.task == task]
+        if len(job) and len(alone):
+            interval = mean_interval(alone.set_index(["task", "seed"]).base_success)
+            rows.append({"task": task} | _results(job) | {
+                "imitated": interval.value, "imitated_low": max(interval.low, 0.0), "imitated_high": min(interval.high, 1.0),
+                "imitated_seeds": len(alone)})
+    return pd.DataFrame(rows).reindex(columns=columns)
+
+
 def over_diffusion(tables: Mapping[str, pd.DataFrame] | None = None) -> pd.DataFrame:
     """The same for the tasks on which a Diffusion Policy was decorated: there it is the *last* policy that is tested, after fewer steps.
 

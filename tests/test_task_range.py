@@ -76,6 +76,23 @@ def test_what_is_recorded_over_a_diffusion_policy(results):
     assert [float(np.ravel(line.get_xdata())[0]) for line in ax.lines if line.get_marker() == "s"] == pytest.approx([0.5255, 0.999])
 
 
+def test_longer_imitation_beside_decoration(tasks):
+    """Only tasks that both records have; intervals over the seeds of each."""
+    jobs = pd.DataFrame([dict(task=task, policy="bet", seed=seed, episodes=200, env_steps=10, base_success=0.5, decorated_success=end,
+                              decorated_success_at_end=0) for task in ("Door", "Pen") for seed, end in enumerate((0.9, 0.95, 1.0))])
+    longer = pd.DataFrame([dict(task=task, seed=seed, base_success=end)
+                           for task in ("Pen", "Hammer") for seed, end in enumerate((0.6, 0.7, 0.8))])
+    (row,) = task_range.beside_imitation(jobs, longer).to_dict("records")
+    half = 4.302653 * 0.1 / np.sqrt(3)  # Student's t over three seeds
+    assert (row["task"], row["base"], row["imitated_seeds"]) == ("Pen", 0.5, 3) and row["imitated"] == pytest.approx(0.7)
+    assert (row["imitated_low"], row["imitated_high"]) == pytest.approx((0.7 - half, 0.7 + half), abs=1e-6)
+    assert row["decorated"] == pytest.approx(0.95) and row["high"] == 1.0
+    (ax,) = plots_range.imitation_figure(pd.DataFrame([row])).axes
+    assert [float(line.get_xdata()[0]) for line in ax.lines] == pytest.approx([0.5, 0.7, 0.95])
+    assert [label.get_text() for label in ax.get_yticklabels()] == ["Pen (3; 3 seeds)"]
+    assert task_range.beside_imitation(jobs, pd.DataFrame(columns=["task"])).empty
+
+
 def test_rates_by_temperature_the_task_that_gains_most_first(results):
     assert task_range.by_temperature().empty
     rates = {"Pen": (0.5, 0.6, 0.4), "Door": (0.3, 0.8, 0.9)}

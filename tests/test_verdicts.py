@@ -572,6 +572,21 @@ def test_novel_objects_and_the_mlp_below_them(results, ends, verdict):
     assert found.measured.startswith("mlp 70.0 %") and "not judged: Door +10.0" in found.measured
 
 
+@pytest.mark.parametrize("faucets, chairs, verdict", [(0.4, 0.3, "reproduced"), (0.4, 0.0, "reproduced"), (-0.3, -0.35, "not"),
+                                                      (0.4, -0.2, "partly")])
+def test_novel_objects_are_set_against_the_demonstrations_own(results, faucets, chairs, verdict):
+    """The same policy on both; a task that is clearly easier with novel objects keeps the other from telling for both."""
+    def tested(task, less):
+        successes = np.array([0.6, 0.62, 0.58])
+        return [runs("mlp", [np.nan] * 3, base=base, task=name) for name, base in ((f"{task}Source", successes), (task, successes - less))]
+
+    assert verdicts.find("Tasks whose objects vary are very challenging.") is None
+    write(results, "object_gap", *tested("TurnFaucet", np.array([0.01, -0.01, 0]) + faucets),
+          *tested("PushChair", np.array([0, 0.01, -0.01]) + chairs))
+    found = verdicts.find("Tasks whose objects vary are very challenging.")
+    assert (found.tasks, found.verdict) == ("TurnFaucet PushChair", verdict) and f"TurnFaucet {100 * faucets:+.1f}" in found.measured
+
+
 def test_pictures_need_three_runs_like_anything_else(results):
     claim = CLAIMS.claim[CLAIMS.claim.str.startswith("Policy Decorator improves base policies that see pictures")].item()
     door = [runs(recipe, ends, base=0.4) for recipe, ends in (("pixels", [0.9]), ("state", [0.1] * 3))]
