@@ -21,7 +21,9 @@ from .tasks import TASKS
 from .tasks.partnet import object_set
 
 KEYS = ["task", "recipe", "seed"]  # a row with the same ones is replaced
-CLOCK = ["seconds", "eval_seconds"]  # of a run's curve: another machine's, and nothing is drawn from them; the row has its minutes
+# Of a run's metrics.csv, what its recorded curve leaves out, so that the repository stays small: the clock of another machine, and what no
+# figure or verdict reads.
+UNRECORDED = ["seconds", "eval_seconds", "residual_abs", "target_mean", "train_length", "train_episodes"]
 TRAINING = "pdkit train decorated"  # how a command that makes a row of a training begins
 SETTINGS = "settings"  # the column that tells rows of other settings apart: a `mark`, whose settings the manifest holds
 UNTIED = {*NO_MATTER, "threads", "pictures", "strict"}  # what a row's settings do not tell, as its numbers do not depend on it
@@ -32,7 +34,7 @@ OWN = ",partnet"  # behind the recipe of a row on the user's own objects
 def record(name: str, rows: pd.DataFrame, curves: pd.DataFrame, settings: Mapping[str, dict[str, Any]] | None = None) -> None:
     """Add rows to data/results/NAME.csv and, where there are curves, NAME_curves.csv, and draw a picture a task of trainings.
 
-    Numbers keep six significant digits, those of curves three, which have no CLOCK: more than is drawn, and the repository stays small.
+    Numbers keep six significant digits, those of curves, which have no UNRECORDED columns, three: more than is drawn.
 
     `settings` are those of the rows by their mark (column SETTINGS); the manifest keeps them.
 
@@ -43,7 +45,7 @@ def record(name: str, rows: pd.DataFrame, curves: pd.DataFrame, settings: Mappin
     """
     folder, tables = DATA / "results", []
     rows, curves = (table.assign(recipe=table.recipe.where(~_on_own_objects(table), table.recipe + OWN)) if len(table) else table
-                    for table in (rows, curves.drop(columns=CLOCK, errors="ignore")))
+                    for table in (rows, curves.drop(columns=UNRECORDED, errors="ignore")))
     with _alone():
         for path, new, digits in ((folder / f"{name}.csv", rows, 6), (folder / f"{name}_curves.csv", curves, 3)):
             if new.empty:
