@@ -22,6 +22,7 @@ from pdkit.rl.calql import CalQL, Conservative, WithReturns
 from pdkit.rl.replay import Replay
 from pdkit.rl.sac import SACConfig
 from pdkit.runs import Run
+from pdkit.seeds import rollout_seeds
 from pdkit.unlearning import set_spread
 
 SPEC = PROBES["reach"]
@@ -226,6 +227,8 @@ def test_mixed_data_are_demonstrations_and_rollouts():
         trainer = start(method)
         data = trainer.demos.unpack(trainer.demos.rows)
         sizes[method] = len(data["mc"]), float((data["mc"] == -10).float().mean())
+        if method == "calql_a":
+            assert trainer._rollouts.seeds.tolist() == list(rollout_seeds(6))  # none that a demonstration or a test has
     assert sizes["calql_b"][1] == 0 and sizes["calql_a"][1] > 0.3 and sizes["calql_a"][0] > sizes["calql_b"][0] + 100
 
 

@@ -281,6 +281,7 @@ def test_wheels_grip_and_seats_do_not_touch_their_feet(fast):
         for shape in link.collision_shapes:
             assert shape.physical_material.dynamic_friction == pytest.approx(1.0 if name.startswith("wheel") else 0.1)
             assert bool(shape.collision_groups[2] & 1 << 31) == (name in ("seat", "support"))
+            assert shape.density == pytest.approx(200)  # kilograms a cubic metre: ManiSkill 2's
 
 
 def test_starts_are_maniskill_2s():

@@ -134,11 +134,13 @@ def test_motion_is_measured_within_chunks_too():
 
 def test_rollouts_of_chunks_are_recorded_step_by_step():
     """A constant action gives the same episodes whether it is decided on once or three times as often."""
-    seeds, played = range(4), []
+    seeds, played, started = range(4), [], []
     for chunk in (1, 3):
         policy = ProbeBase(dict(obs_dim=4, act_dim=2, kind="zero"))
         policy.chunk, policy.act = chunk, lambda windows, chunk=chunk: np.full((len(windows), chunk, 2), 0.4, np.float32)
+        policy.reset = started.append
         played.append(rollouts(policy, PROBES["reach"], seeds))
+    assert started == [0, 0]  # so that one that samples makes the same again
     for name in ("observations", "actions", "success", "lengths"):
         assert np.array_equal(getattr(played[0], name), getattr(played[1], name)), name
 

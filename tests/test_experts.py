@@ -4,7 +4,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pdkit.demos import experts
+from pdkit.demos import experts, peg_expert
+from pdkit.demos.chair_expert import PushChairExpert
 from pdkit.demos.experts import EXPERTS, StackCubeExpert, scripted_episodes
 from pdkit.errors import PdkitError
 from pdkit.tasks import get_task
@@ -64,6 +65,44 @@ class Sometimes(StackCubeExpert):
         if self.always or Sometimes.episodes % 2:
             return np.zeros(4, np.float32)
         return super().act(observation)
+
+
+def test_each_episode_has_noise_of_its_own(monkeypatch):
+    drawn = []
+
+    class Drawing(StackCubeExpert):
+        def reset(self, rng):
+            super().reset(rng)
+            drawn.append(rng.random())
+
+    monkeypatch.setitem(EXPERTS, "StackCube", Drawing)
+    for first in (0, 0, 1):
+        list(scripted_episodes("StackCube", 1, first))
+    assert drawn[0] == drawn[1] != drawn[2]
+
+
+def test_near_the_hole_and_there_alone_the_noise_is_small(monkeypatch):
+    told, expert = [], peg_expert.PegInsertionSideExpert(0.5)
+    monkeypatch.setattr(peg_expert, "pose_action", lambda move, turning, gripper, noise, rng: told.append(noise))
+    sim = get_task("PegInsertionSide").make()
+    observation = sim.reset(0)
+    sim.close()
+    expert.reset(np.random.default_rng(0))
+    expert.act(observation)
+    expert._stage = "insert"
+    monkeypatch.setattr(expert, "_advance", lambda scene: None)
+    expert.act(observation)
+    assert told == [0.5, pytest.approx(0.05)]
+
+
+def test_the_chairs_expert_turns_with_noise_too():
+    sim, expert = get_task("PushChairSource").make(), PushChairExpert(0.1)
+    observation = sim.reset(0)
+    sim.close()
+    expert.reset(np.random.default_rng(0))
+    actions = np.stack([expert.act(observation) for _ in range(50)])
+    inside = np.abs(actions[:, :3]).max(axis=0) < 1
+    assert inside[2] and actions[:, :3].std(axis=0)[inside].min() > 0.05 and not actions[:, 3:].std(axis=0).any()
 
 
 def test_failures_are_skipped_and_counted(monkeypatch):

@@ -70,6 +70,26 @@ def seed_of(sim, model: int) -> int:
     return next(seed for seed in range(1000) if faucet_start(seed, sim.models).model == model)
 
 
+def test_starts_are_maniskill_2s():
+    from pdkit.tasks.faucet_env import faucet_start
+
+    models = faucets(novel=False)
+    starts = [faucet_start(seed, models) for seed in range(400)]
+    yaws, places = np.array([start.yaw for start in starts]), np.array([start.place for start in starts])
+    assert np.radians(14.5) < np.abs(yaws).max() <= np.radians(15) and 0.048 < np.abs(places).max() <= 0.05
+    assert {start.model for start in starts} == set(range(len(models)))
+    start = starts[0]
+    assert start.pose(models[start.model]).p == pytest.approx([*start.place, models[start.model].height + 0.01])
+
+
+def test_a_handle_without_a_limit_is_turned_a_quarter_round():
+    for limit, first, target in (((-np.inf, np.inf), 0, np.pi / 2), ((-1.0, 1.0), -1, 0.8)):
+        sim = TurnFaucet.__new__(TurnFaucet)
+        sim._joint = SimpleNamespace(limit=np.array([limit], np.float32))
+        sim._aim()
+        assert (sim._first_angle, sim._target_angle) == (pytest.approx(first), pytest.approx(target))
+
+
 # ---- the faucets -----------------------------------------------------------------------------------------------------
 
 def test_source_and_novel_faucets_differ():

@@ -1,5 +1,6 @@
 """Demonstrations of ManiSkill's hub: real trajectory files, recorded by ManiSkill's own wrapper, and what can be wrong with one."""
 import contextlib
+import dataclasses
 import io
 import json
 import shutil
@@ -124,6 +125,22 @@ def test_what_is_solved_here_from_the_same_start_is_kept_and_the_rest_is_counted
     changed_card(copied, lambda card: card["episodes"].pop())
     with pytest.raises(PdkitError, match="None of the 2 episodes of StackCube.*1 start elsewhere.*1 are not solved"):
         hub.from_hub("StackCube", 2, copied)
+
+
+def test_who_made_a_file_is_its_label_and_the_task_s_limit_holds(copied, monkeypatch):
+    changed_card(copied, lambda card: card.update(source_type="rl"))
+    assert hub.from_hub("StackCube", 1, copied).label == "agent"
+    short = dataclasses.replace(get_task("StackCube"), max_episode_steps=5)
+    monkeypatch.setattr(hub, "get_task", lambda name: short)
+    with pytest.raises(PdkitError, match="None of the 1 episodes.*0 start elsewhere.*1 are not solved"):
+        hub.from_hub("StackCube", 1, copied)
+
+
+def test_a_start_two_millimetres_off_is_elsewhere(copied):
+    with h5py.File(copied, "a") as file:
+        file["traj_0/env_states/actors/cubeA"][0, 0] += 0.002
+    with pytest.raises(PdkitError, match="None of the 1 episodes.*1 start elsewhere"):
+        hub.from_hub("StackCube", 1, copied)
 
 
 def test_actions_in_the_task_s_own_control_mode_are_executed_as_they_are(tmp_path):

@@ -4,6 +4,7 @@ import re
 import numpy as np
 import pytest
 import torch
+from peft.tuners.tuners_utils import BaseTunerLayer
 from test_probes import SMALL, success
 from worlds import clone, reach_demos
 
@@ -16,6 +17,7 @@ from pdkit.methods.registry import make_trainer, method_config
 from pdkit.online import Trainer
 from pdkit.online_config import OnlineConfig
 from pdkit.policies import BeT, BeTForSAC, load_policy, save_policy
+from pdkit.policies.lora import with_lora
 from pdkit.probes import PROBES, biased_base
 from pdkit.profiles import flat
 from pdkit.tasks import TASKS
@@ -86,6 +88,8 @@ def test_lora_starts_as_the_policy_and_trains_little(bet_sac, tmp_path):
     trained = {n for n, p in adapted.named_parameters() if p.requires_grad}
     assert trained and all("lora_" in n or n.startswith("spread.") for n in trained)
     assert {n.split(".lora")[0] for n in trained if "lora_" in n} == {"gpt.blocks.0.qkv", "gpt.blocks.0.proj", "regression"}
+    for module in (adapted, with_lora(torch.nn.Sequential(torch.nn.Linear(3, 3)), 2)):
+        assert {part.scaling["default"] for part in module.modules() if isinstance(part, BaseTunerLayer)} == {1.0}  # alpha is the rank
     with torch.no_grad():
         next(p for n, p in adapted.named_parameters() if "regression.lora_B" in n).fill_(0.1)
     save_policy(adapted, tmp_path / "p")
@@ -126,6 +130,14 @@ def test_every_method_has_a_configuration_in_every_profile(method):
 @pytest.mark.parametrize("method", ["rot", "fish"])
 def test_under_a_reward_by_likeness_no_task_ends_an_episode_at_success(method, task):
     assert method_config(method, task).on_success == "continue"
+
+
+@pytest.mark.parametrize("task", ["StackCube", "TurnFaucet", "PushChair"])
+@pytest.mark.parametrize("profile", ["lesson", "paper"])
+def test_fish_bounds_all_numbers_of_an_action_alike(task, profile):
+    """The lesson's decorator does not, on these tasks."""
+    decorator = method_config("fish", task, profile).decorator
+    assert (decorator.alpha, decorator.alpha_scale, decorator.H) == (0.2, (), 0)
 
 
 @pytest.mark.parametrize(("method", "changes"), [
@@ -189,7 +201,8 @@ CALQL = dict(calql_offline_updates=20_000, calql_actions=10, calql_weight=1.0, c
 
 
 @pytest.mark.parametrize("method, numbers", [  # facts.md 3.1 to 3.7, appendix B.5; PPO: cleanrl
-    ("jsrl", dict(jsrl_step=10, jsrl_episodes=100)),
+    ("jsrl", dict(jsrl_step=10, jsrl_episodes=100, select="last")),
+    ("dppo", dict(ppo_lr=1e-4, ppo_grad_clip=1e6, dppo_value_lr=1e-3, lora=0)),
     ("rot", dict(ot_epsilon=0.01, ot_iterations=100, ot_total=10.0, ot_trunk=50, ot_renew_every=10_000, bc_weight=0.03)),
     ("fish", dict(ot_epsilon=0.01, ot_iterations=100, ot_total=10.0, bc_weight=0.03, alpha=0.2, H=0, critic_input="concat",
                   actor_input="obs+base")),

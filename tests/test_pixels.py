@@ -436,6 +436,18 @@ def test_pictures_are_shifted_while_a_policy_learns_from_them(monkeypatch):
         assert shifts == 3 * [shifted] * (shifted > 0) and sum(sevens) == 3 * (shifted > 0)  # what is shifted is what is seen
 
 
+def test_the_weights_of_an_encoder_decay_as_the_policys_do(monkeypatch):
+    monkeypatch.setitem(pixel_sim.EYES, "probe", Painted)
+    demos, made = reach_demos(2), []
+    pictures = draw(demos, spec=PROBES["reach"], view=REACH)
+    make = learn.make_optimizer
+    monkeypatch.setattr(learn, "make_optimizer", lambda *given: made.append(make(*given)) or made[-1])
+    config = ImitateConfig(iterations=1, batch=8, eval_episodes=0, bf16=False, weight_decay=0.3)
+    _, encoder, _ = imitate_pixels("mlp", demos, pictures, config, {"hidden": 16}, spec=PROBES["reach"], view=REACH)
+    group = made[0].param_groups[-1]
+    assert group["weight_decay"] == 0.3 and sum(p.numel() for p in group["params"]) == sum(p.numel() for p in encoder.parameters())
+
+
 def test_an_interrupted_training_from_pictures_goes_on_to_the_same_policy_and_encoder(tmp_path, monkeypatch):
     monkeypatch.setitem(pixel_sim.EYES, "probe", Painted)
     demos = reach_demos(2)

@@ -71,6 +71,32 @@ def test_bins_are_the_k_means_centres():
         policy.fit_statistics(np.zeros((2, 3), np.float32), np.zeros((2, 2), np.float32))
 
 
+def test_bins_depend_on_the_seed():
+    actions = np.random.default_rng(0).uniform(-1, 1, (300, 2)).astype(np.float32)
+    one, same, other = (bet(bins=8) for _ in range(3))
+    for policy, seed in ((one, 0), (same, 0), (other, 1)):
+        policy.fit_statistics(np.zeros((300, 3), np.float32), actions, seed)
+    assert torch.equal(one.centres, same.centres) and not torch.allclose(one.centres, other.centres, atol=1e-3)
+
+
+def test_what_a_policy_acts_lies_within_the_action_space():
+    policy = POLICIES["mlp"](dict(obs_dim=3, act_dim=2, hidden=8)).eval()
+    with torch.no_grad():
+        for parameter in policy.parameters():
+            parameter.fill_(5.0)
+        beyond = policy(torch.ones(1, 1, 3))
+    assert beyond.min() > 1 and policy.act(np.ones((1, 1, 3), np.float32)).tolist() == [[[1.0, 1.0]]]
+
+
+def test_a_recurrent_policy_learns_at_every_position_of_a_window():
+    policy = POLICIES["rnn"](dict(obs_dim=3, act_dim=2, window=4, hidden=8))
+    windows, actions = torch.randn(5, 4, 3), torch.randn(5, 4, 2)
+    loss = policy.loss(windows, actions)["loss"]
+    assert torch.allclose(loss, (policy._actions(windows) - actions).square().mean())
+    actions[:, 0] += 1
+    assert not torch.allclose(policy.loss(windows, actions)["loss"], loss)
+
+
 def test_offsets_are_learned_at_the_true_bin_only():
     policy = bet(dropout=0.0)
     policy.centres.copy_(torch.tensor([[0.0, 0.0], [5.0, 5.0], [-5.0, 5.0]]))
@@ -284,6 +310,19 @@ def test_every_gradient_step_has_the_rate_of_the_schedule():
 
     best_checkpoint(settings, step, optimizer, Average([weight], 0.0), lambda: ({}, {}), None)
     assert rates == pytest.approx([0, 0.25, 0.5, 0.25 * (1 + 0.5**0.5), 0.25, 0.25 * (1 - 0.5**0.5)])
+
+
+def test_of_equally_good_checkpoints_the_first_is_chosen():
+    weight, scores = torch.nn.Parameter(torch.zeros(())), [0.2, 0.5, 0.5, 0.1]
+    settings, met = ImitateConfig(iterations=4, eval_every=1), []
+
+    def candidate():
+        met.append(len(met))
+        return met[-1], {"success_once": scores[met[-1]]}
+
+    chosen, _ = best_checkpoint(settings, lambda: {"loss": torch.zeros(())}, torch.optim.SGD([weight], lr=1.0), Average([weight], 0.0),
+                                candidate, None)
+    assert chosen == 1 and met == [0, 1, 2, 3]
 
 
 def test_policies_are_chosen_on_selection_episodes_and_reported_on_others(monkeypatch):

@@ -135,6 +135,10 @@ def test_bootstrap_is_seeded_stratified_and_about_right():
     error = 1.96 * np.sqrt(np.mean(scores.var(axis=0)) / scores.size)
     assert first.value == pytest.approx(scores.mean())
     assert first.high - first.low == pytest.approx(2 * error, rel=0.12)
+    # Tasks whose runs go together are drawn apart all the same.
+    alike = np.repeat(rng.normal(size=(40, 1)), 3, axis=1)
+    apart = stats.stratified_bootstrap(stats.mean, alike, seed=1)
+    assert apart.high - apart.low == pytest.approx(2 * 1.96 * alike.std() / np.sqrt(alike.size), rel=0.15)
     worse = scores - 1
     chance = stats.stratified_bootstrap(stats.probability_of_improvement, scores, worse, seed=0, repetitions=200)
     assert chance.low < chance.value < chance.high

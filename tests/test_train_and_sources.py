@@ -155,11 +155,15 @@ def test_agent_episodes_are_what_the_simulator_did(monkeypatch):
     episodes = sources.agent_episodes(base, "reach", 6, 100, 0.1, 3)
     assert started == [100]  # so that one that samples makes the same again
     assert len(episodes) == 6 and all(e["success"].any() for e in episodes)
+    limit = PROBES["reach"].max_episode_steps
     for e in episodes:
         assert len(e["observations"]) == len(e["actions"]) + 1
-        assert len(e["actions"]) <= np.argmax(e["success"]) + 1 + 3
+        assert len(e["actions"]) == len(e["success"]) == min(np.argmax(e["success"]) + 1 + 3, limit)
         moved = np.clip(e["observations"][:-1, :2] + 0.2 * e["actions"], -1.5, 1.5)
         assert np.allclose(moved, e["observations"][1:, :2], atol=1e-5)
+    noises = [e["actions"][0] - base.act(e["observations"][:1][None])[0, 0] for seed in (100, 100, 200)
+              for e in sources.agent_episodes(base, "reach", 1, seed, 0.001, 3)[:1]]
+    assert np.allclose(noises[0], noises[1]) and not np.allclose(noises[0], noises[2], atol=1e-4)
 
 
 def test_training_from_the_command_line_records_a_row_a_seed(monkeypatch, tmp_path, capsys):

@@ -106,6 +106,7 @@ def test_chunks_sum_rewards_stop_at_the_end_and_count_primitive_steps():
     assert r.windows[0, :, 1].tolist() == [2, 3]
     r = env.step(act(NO, NO, chunk=3))
     assert r.steps.tolist() == [1, 1] and r.truncated.all() and r.final_windows[0, :, 1].tolist() == [3, 4]
+    assert r.reward.tolist() == [0, 0] and not r.solved.any()  # what the last chunk solved is not paid again
 
 
 def test_actions_are_clipped_and_wrong_shapes_refused():
@@ -148,6 +149,16 @@ def test_snapshot_restores_the_exact_episode(workers):
             one, other = first.step(a), second.step(a)
             assert np.array_equal(one.final_windows, other.final_windows) and np.array_equal(one.windows, other.windows)
             assert one.episodes == other.episodes
+
+
+def test_a_snapshot_of_a_young_episode_repeats_its_first_observation():
+    spec, actions = PROBES["reach"], np.full((3, 2, 1, 2), 0.3, np.float32)
+    for steps in range(4):  # windows of 4 are not yet full of what was seen
+        with VectorEnv(spec, 2, lambda lane: 5 + lane, window=4) as first, VectorEnv(spec, 2, lambda lane: 9 + lane, window=4) as second:
+            first.reset()
+            for a in actions[:steps]:
+                first.step(a)
+            assert np.array_equal(second.restore(first.snapshot()), first._windows)
 
 
 def test_workers_change_nothing_on_a_real_task():

@@ -118,6 +118,12 @@ def test_the_start_of_an_episode_is_no_decision():
     plain, excluding = (remembered(demos, bet, k=1, **more) for more in ({}, dict(exclusion=3, history=4)))
     first = np.stack([e["observations"][0] for e in demos.episodes()])[:, None] + 0.01
     assert np.array_equal(plain.act(np.repeat(first, 3, axis=1)), excluding.act(np.repeat(first, 7, axis=1)))
+    played, play = [], excluding._play
+    excluding._play = lambda decisions: played.append(len(decisions)) or play(decisions)
+    episode = np.concatenate([first[0], first[0] + np.arange(1, 4)[:, None]])  # after a first observation three others
+    for seen in range(1, 5):
+        excluding.act(np.concatenate([np.repeat(episode[:1], 7 - seen, axis=0), episode[:seen]])[None])
+    assert played == [1, 2, 3, 4]
 
 
 def remembered(demos, bet=None, folder=None, **config):
@@ -215,6 +221,10 @@ def test_save_and_load_needs_no_other_folder(tmp_path):
     assert isinstance(again, VINN) and np.array_equal(again.act(x), policy.act(x))
     assert sorted(p.name for p in (tmp_path / "vinn").iterdir()) == ["policy.json", "weights.safetensors"]
     assert str(tmp_path) not in (tmp_path / "vinn" / "policy.json").read_text()
+    raw = VINN({"obs_dim": 4, "act_dim": 2, "k": 1, "skip": 2})
+    raw.remember(torch.randn(9, 1, 4), torch.randn(9, 2))
+    save_policy(raw, tmp_path / "raw")
+    assert np.array_equal(load_policy(tmp_path / "raw").act(x), raw.act(x))
     card = json.loads((tmp_path / "vinn" / "policy.json").read_text())
     card["config"]["rows"] -= 1
     (tmp_path / "vinn" / "policy.json").write_text(json.dumps(card))
