@@ -132,6 +132,12 @@ def test_under_a_reward_by_likeness_no_task_ends_an_episode_at_success(method, t
     assert method_config(method, task).on_success == "continue"
 
 
+@pytest.mark.parametrize("profile", ["lesson", "paper"])
+def test_what_jsrl_has_learned_is_its_last_policy(profile):
+    """Evaluations on the way are of a policy that the base policy begins for, at horizons of their own."""
+    assert method_config("jsrl", "Door", profile).select == "last"
+
+
 @pytest.mark.parametrize("task", ["StackCube", "TurnFaucet", "PushChair"])
 @pytest.mark.parametrize("profile", ["lesson", "paper"])
 def test_fish_bounds_all_numbers_of_an_action_alike(task, profile):
@@ -201,7 +207,7 @@ CALQL = dict(calql_offline_updates=20_000, calql_actions=10, calql_weight=1.0, c
 
 
 @pytest.mark.parametrize("method, numbers", [  # facts.md 3.1 to 3.7, appendix B.5; PPO: cleanrl
-    ("jsrl", dict(jsrl_step=10, jsrl_episodes=100, select="last")),
+    ("jsrl", dict(jsrl_step=10, jsrl_episodes=100)),
     ("dppo", dict(ppo_lr=1e-4, ppo_grad_clip=1e6, dppo_value_lr=1e-3, lora=0)),
     ("rot", dict(ot_epsilon=0.01, ot_iterations=100, ot_total=10.0, ot_trunk=50, ot_renew_every=10_000, bc_weight=0.03)),
     ("fish", dict(ot_epsilon=0.01, ot_iterations=100, ot_total=10.0, bc_weight=0.03, alpha=0.2, H=0, critic_input="concat",
