@@ -576,10 +576,10 @@ def test_novel_objects_and_the_mlp_below_them(results, ends, verdict):
     assert found.measured.startswith("mlp 70.0 %") and "not judged: Door +10.0" in found.measured
 
 
-@pytest.mark.parametrize("faucets, chairs, verdict", [(0.4, 0.3, "reproduced"), (0.4, 0.0, "reproduced"), (-0.3, -0.35, "not"),
+@pytest.mark.parametrize("faucets, chairs, verdict", [(0.4, 0.3, "reproduced"), (0.4, 0.002, "partly"), (-0.3, -0.35, "not"),
                                                       (0.4, -0.2, "partly")])
 def test_novel_objects_are_set_against_the_demonstrations_own(results, faucets, chairs, verdict):
-    """The same policy on both; a task that is clearly easier with novel objects keeps the other from telling for both."""
+    """The same policy on both; a task without a gap keeps the other from telling for both."""
     def tested(task, less):
         successes = np.array([0.6, 0.62, 0.58])
         return [runs("mlp", [np.nan] * 3, base=base, task=name) for name, base in ((f"{task}Source", successes), (task, successes - less))]

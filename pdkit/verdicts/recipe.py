@@ -20,13 +20,16 @@ from ..claims import (
     difference,
     finding,
     jointly,
+    judged,
     judged_over_tasks,
     matched,
+    mean_interval,
     not_counted,
     percent,
     points,
     recorded,
     set_against,
+    set_apart,
     signed,
     task_by_task,
     weakest,
@@ -207,10 +210,14 @@ def _() -> Finding:
 
 @measures("Tasks whose objects vary")
 def _() -> Finding:
-    """Less success of base policies on novel objects than on those of their demonstrations, the same policy on both. (Chosen when one
-    training of each task was known. How hard a task is without novel objects, the paper's other reason, is not asked.)"""
+    """Less success of base policies on novel objects than on those of their demonstrations, the same policy on both, on each of the two
+    tasks. (Their mean was judged first, with "reproduced", though one of the two shows no gap. How hard a task is without novel objects,
+    the paper's other reason, is not asked.)"""
     runs = recorded("object_gap")[0]
     own = runs.task.str.endswith("Source")
     runs = runs.assign(task=runs.task.str.removesuffix("Source"))
     shown, novel = (by_seed(rows, "mlp", "base_success") for rows in (runs[own], runs[~own]))
-    return set_against("object_gap", shown, novel, ("base policies on the demonstrations' objects", "on novel ones"), paper=NOVEL)
+    interval, values, (first, second), told = set_apart(shown, novel, NOVEL)
+    return finding("object_gap", values, f"base policies solve {percent(first)} with the demonstrations' objects and {percent(second)} "
+                   f"with novel ones: {signed(interval.value)} points{told}", points(interval),
+                   jointly(*(judged(mean_interval(mine)) for _, mine in values.groupby(level="task"))), NOVEL)
