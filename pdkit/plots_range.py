@@ -61,24 +61,26 @@ def over_diffusion_figure(tasks: pd.DataFrame) -> Picture:
 
 @styled
 def imitation_figure(tasks: pd.DataFrame, title: str = "") -> Picture:
-    """Rows of `task_range.beside_imitation`: base policy, longer imitation and decorated policy of a task in a line, with intervals."""
-    _columns(tasks, "task", "base", "decorated", "imitated")
-    figure, axes = blank(size=(8.2, 1.3 + 0.42 * len(tasks)))
+    """Rows of `task_range.beside_imitation`: base policy, longer imitation and what decoration makes of either, with intervals."""
+    _columns(tasks, "task", "base", "decorated", "imitated", "over")
+    figure, axes = blank(size=(8.2, 1.5 + 0.46 * len(tasks)))
     ax, marks = axes[0, 0], []
-    for name, start, marker, color, aside in (("base policy, as it is decorated", "base", "o", COLORS["base"], -0.2),
-                                              ("imitation alone, longer", "imitated", "D", PALETTE[2], 0.0),
-                                              ("decorated", "decorated", "o", COLORS["decorated"], 0.2)):
-        ends = ("low", "high") if start == "decorated" else (f"{start}_low", f"{start}_high")
-        y = np.arange(len(tasks)) + aside
-        ax.hlines(y, tasks[ends[0]], tasks[ends[1]], color=color, lw=5, alpha=0.25, zorder=1)
-        ax.plot(tasks[start], y, marker, ms=6, color=color)
-        marks.append(Line2D([], [], marker=marker, ls="", color=color, label=name))
-    ax.set_yticks(range(len(tasks)), [f"{row.task} ({row.imitated_seeds}; {row.seeds} seeds)" for row in tasks.itertuples()])
+    kinds = (("base policy", "base", "o", COLORS["base"]), ("it decorated", "decorated", "o", COLORS["decorated"]),
+             ("longer imitation", "imitated", "D", PALETTE[2]), ("that decorated", "over", "D", PALETTE[4]))
+    for place, (name, column, marker, color) in enumerate(kinds):
+        low, high, seeds = ("low", "high", "seeds") if column == "decorated" else (f"{column}_{end}" for end in ("low", "high", "seeds"))
+        y = np.arange(len(tasks)) + 0.2 * place - 0.3
+        ax.hlines(y, tasks[low], tasks[high], color=color, lw=4, alpha=0.25, zorder=1)
+        ax.plot(tasks[column], y, marker, ms=5.5, color=color)
+        counts = sorted(set(tasks[seeds].dropna().astype(int))) if seeds in tasks else []
+        told = f" ({' or '.join(map(str, counts))} seeds)" if counts else ""
+        marks.append(Line2D([], [], marker=marker, ls="", color=color, label=name + told))
+    ax.set_yticks(range(len(tasks)), tasks.task)
     ax.set(ylim=(len(tasks) - 0.5, -0.5), xlim=(0, 1.03), xlabel="success within the episode", title=title)
     ax.xaxis.set_major_formatter(mpl.ticker.PercentFormatter(1.0, decimals=0))
     ax.grid(axis="y", visible=False)
-    marks.append(Line2D([], [], lw=5, alpha=0.8, color=COLORS["recorded"], solid_capstyle="butt", label="95 % interval"))
-    figure.legend(handles=marks, loc="outside lower center", ncols=4, fontsize=8.5)
+    marks.append(Line2D([], [], lw=4, alpha=0.8, color=COLORS["recorded"], solid_capstyle="butt", label="95 % interval"))
+    figure.legend(handles=marks, loc="outside lower center", ncols=5, fontsize=8.5, columnspacing=1.2, handletextpad=0.3)
     return figure
 
 

@@ -175,7 +175,7 @@ def pictures(tables: Mapping[str, pd.DataFrame]) -> Iterator[tuple[str, Picture]
 
     if "main_job" in tables:
         yield "all_tasks", _range(tables)
-    beside = task_range.beside_imitation(rows("main_job"), rows("longer_imitation"))
+    beside = task_range.beside_imitation(*map(rows, ("main_job", "longer_imitation", "over_longer_imitation")))
     if len(beside):
         yield "beside_imitation", plots_range.imitation_figure(beside, "What imitation alone comes to, and what decoration does")
     sampled = task_range.over_diffusion({name: rows(name) for name in task_range.DIFFUSION})

@@ -63,23 +63,28 @@ def by_task(table: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows).reindex(columns=COLUMNS)
 
 
-def beside_imitation(jobs: pd.DataFrame, longer: pd.DataFrame) -> pd.DataFrame:
+def beside_imitation(jobs: pd.DataFrame, longer: pd.DataFrame, over: pd.DataFrame) -> pd.DataFrame:
     """For each task of longer_imitation.csv, what its decorated policies come to beside what imitation alone would have.
 
-    Columns: task, seeds, episodes, base, base_low, base_high, decorated, low, high (of the main job: as in `by_task`), imitated (mean over
-    the seeds of the longer imitation), imitated_low, imitated_high (Student's t), imitated_seeds. Tasks that `jobs` has not are left out.
+    Columns: task, base, base_low, base_high, decorated, low, high, seeds (of the main job: as in `by_task`); of the longer imitation
+    imitated (mean over seeds), imitated_low, imitated_high (Student's t), imitated_seeds; and the same of over_longer_imitation.csv, the
+    decorator over one of these policies, as over_... (NaN where that was not run). Tasks that `jobs` has not are left out.
     """
-    columns = ["task", "seeds", "episodes", "base", "base_low", "base_high", "decorated", "low", "high", "imitated", "imitated_low",
-               "imitated_high", "imitated_seeds"]
+    columns = ["task", "base", "base_low", "base_high", "decorated", "low", "high", "seeds",
+               *(f"{what}{part}" for what in ("imitated", "over") for part in ("", "_low", "_high", "_seeds"))]
     rows = []
     for task in (task for suite in reversed(SUITES) for task in TASKS[suite]):
-        job, alone = jobs[jobs.task == task], longer[longer.task == task]
+        job, alone, above = (table[table.task == task] for table in (jobs, longer, over))
         if len(job) and len(alone):
-            interval = mean_interval(alone.set_index(["task", "seed"]).base_success)
-            rows.append({"task": task} | _results(job) | {
-                "imitated": interval.value, "imitated_low": max(interval.low, 0.0), "imitated_high": min(interval.high, 1.0),
-                "imitated_seeds": len(alone)})
+            rows.append({"task": task} | _results(job) | _over_seeds("imitated", alone, "base_success")
+                        | (_over_seeds("over", above, "decorated_success") if len(above) >= ENOUGH else {}))
     return pd.DataFrame(rows).reindex(columns=columns)
+
+
+def _over_seeds(name: str, rows: pd.DataFrame, column: str) -> dict[str, float]:
+    interval = mean_interval(rows.set_index(["task", "seed"])[column])
+    return {name: interval.value, f"{name}_low": max(interval.low, 0.0), f"{name}_high": min(interval.high, 1.0),
+            f"{name}_seeds": len(rows)}
 
 
 def over_diffusion(tables: Mapping[str, pd.DataFrame] | None = None) -> pd.DataFrame:

@@ -82,15 +82,18 @@ def test_longer_imitation_beside_decoration(tasks):
                               decorated_success_at_end=0) for task in ("Door", "Pen") for seed, end in enumerate((0.9, 0.95, 1.0))])
     longer = pd.DataFrame([dict(task=task, seed=seed, base_success=end)
                            for task in ("Pen", "Hammer") for seed, end in enumerate((0.6, 0.7, 0.8))])
-    (row,) = task_range.beside_imitation(jobs, longer).to_dict("records")
+    over = pd.DataFrame([dict(task="Pen", seed=seed, base_success=0.6, decorated_success=end) for seed, end in enumerate((0.8, 0.9, 1.0))])
+    (row,) = task_range.beside_imitation(jobs, longer, over).to_dict("records")
     half = 4.302653 * 0.1 / np.sqrt(3)  # Student's t over three seeds
     assert (row["task"], row["base"], row["imitated_seeds"]) == ("Pen", 0.5, 3) and row["imitated"] == pytest.approx(0.7)
     assert (row["imitated_low"], row["imitated_high"]) == pytest.approx((0.7 - half, 0.7 + half), abs=1e-6)
-    assert row["decorated"] == pytest.approx(0.95) and row["high"] == 1.0
-    (ax,) = plots_range.imitation_figure(pd.DataFrame([row])).axes
-    assert [float(line.get_xdata()[0]) for line in ax.lines] == pytest.approx([0.5, 0.7, 0.95])
-    assert [label.get_text() for label in ax.get_yticklabels()] == ["Pen (3; 3 seeds)"]
-    assert task_range.beside_imitation(jobs, pd.DataFrame(columns=["task"])).empty
+    assert row["decorated"] == pytest.approx(0.95) and row["high"] == 1.0 and row["over"] == pytest.approx(0.9) and row["over_high"] == 1.0
+    figure = plots_range.imitation_figure(pd.DataFrame([row]))
+    assert [float(line.get_xdata()[0]) for line in figure.axes[0].lines] == pytest.approx([0.5, 0.95, 0.7, 0.9])
+    assert [text.get_text() for text in figure.legends[0].get_texts()][2:4] == ["longer imitation (3 seeds)", "that decorated (3 seeds)"]
+    (without,) = task_range.beside_imitation(jobs, longer, over[:2]).to_dict("records")  # two seeds are too few
+    assert np.isnan(without["over"]) and plots_range.imitation_figure(pd.DataFrame([without])).axes
+    assert task_range.beside_imitation(jobs, pd.DataFrame(columns=["task"]), over).empty
 
 
 def test_rates_by_temperature_the_task_that_gains_most_first(results):
