@@ -60,8 +60,9 @@ def over_diffusion_figure(tasks: pd.DataFrame) -> Picture:
 
 
 @styled
-def imitation_figure(tasks: pd.DataFrame, title: str = "") -> Picture:
-    """Rows of `task_range.beside_imitation`: base policy, longer imitation and what decoration makes of either, with intervals."""
+def beside_imitation_figure(tasks: pd.DataFrame, title: str = "") -> Picture:
+    """Rows of `task_range.beside_imitation`: base policy, longer imitation and what decoration makes of either, with intervals:
+    the base policy's over its test episodes, the others' over seeds."""
     _columns(tasks, "task", "base", "decorated", "imitated", "over")
     figure, axes = blank(size=(8.2, 1.5 + 0.46 * len(tasks)))
     ax, marks = axes[0, 0], []

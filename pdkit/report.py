@@ -8,8 +8,8 @@ data/results/claims.csv has a row a claim:
               untested one, the paper's tasks    verdict   reproduced, partly, not or untested
                                                  command   that makes the numbers again
 
-`pdkit report --update` first computes every verdict anew for which there is a rule (pdkit/verdicts) and enough is recorded, and draws
-the `pictures` of several records.
+`pdkit report --update` first computes every verdict anew for which there is a rule (pdkit/verdicts) and enough is recorded, and, where
+nothing is wrong, draws the `pictures` of several records.
 A claim whose verdict is not "untested" has all of them. The recorded tables beside it (a row a run, with its command) are checked
 too: a report on broken tables is refused.
 """
@@ -177,7 +177,7 @@ def pictures(tables: Mapping[str, pd.DataFrame]) -> Iterator[tuple[str, Picture]
         yield "all_tasks", _range(tables)
     beside = task_range.beside_imitation(*map(rows, ("main_job", "longer_imitation", "over_longer_imitation")))
     if len(beside):
-        yield "beside_imitation", plots_range.imitation_figure(beside, "What imitation alone comes to, and what decoration does")
+        yield "beside_imitation", plots_range.beside_imitation_figure(beside, "What imitation alone comes to, and what decoration does")
     sampled = task_range.over_diffusion({name: rows(name) for name in task_range.DIFFUSION})
     if len(sampled):
         yield "over_diffusion", plots_range.over_diffusion_figure(sampled)

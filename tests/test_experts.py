@@ -78,7 +78,7 @@ def test_each_episode_has_noise_of_its_own(monkeypatch):
     monkeypatch.setitem(EXPERTS, "StackCube", Drawing)
     for first in (0, 0, 1):
         list(scripted_episodes("StackCube", 1, first))
-    assert drawn[0] == drawn[1] != drawn[2]
+    assert len(drawn) == 3 and drawn[0] == drawn[1] != drawn[2]
 
 
 def test_near_the_hole_and_there_alone_the_noise_is_small(monkeypatch):

@@ -88,11 +88,11 @@ def test_longer_imitation_beside_decoration(tasks):
     assert (row["task"], row["base"], row["imitated_seeds"]) == ("Pen", 0.5, 3) and row["imitated"] == pytest.approx(0.7)
     assert (row["imitated_low"], row["imitated_high"]) == pytest.approx((0.7 - half, 0.7 + half), abs=1e-6)
     assert row["decorated"] == pytest.approx(0.95) and row["high"] == 1.0 and row["over"] == pytest.approx(0.9) and row["over_high"] == 1.0
-    figure = plots_range.imitation_figure(pd.DataFrame([row]))
+    figure = plots_range.beside_imitation_figure(pd.DataFrame([row]))
     assert [float(line.get_xdata()[0]) for line in figure.axes[0].lines] == pytest.approx([0.5, 0.95, 0.7, 0.9])
     assert [text.get_text() for text in figure.legends[0].get_texts()][2:4] == ["longer imitation (3 seeds)", "that decorated (3 seeds)"]
     (without,) = task_range.beside_imitation(jobs, longer, over[:2]).to_dict("records")  # two seeds are too few
-    assert np.isnan(without["over"]) and plots_range.imitation_figure(pd.DataFrame([without])).axes
+    assert np.isnan(without["over"]) and plots_range.beside_imitation_figure(pd.DataFrame([without])).axes
     assert task_range.beside_imitation(jobs, pd.DataFrame(columns=["task"]), over).empty
 
 

@@ -218,6 +218,8 @@ def _() -> Finding:
     runs = runs.assign(task=runs.task.str.removesuffix("Source"))
     shown, novel = (by_seed(rows, "mlp", "base_success") for rows in (runs[own], runs[~own]))
     interval, values, (first, second), told = set_apart(shown, novel, NOVEL)
+    own = {task: mean_interval(mine) for task, mine in values.groupby(level="task")}
+    each = ", ".join(f"{task} {points(gap)}" for task, gap in own.items())
     return finding("object_gap", values, f"base policies solve {percent(first)} with the demonstrations' objects and {percent(second)} "
-                   f"with novel ones: {signed(interval.value)} points{told}", points(interval),
-                   jointly(*(judged(mean_interval(mine)) for _, mine in values.groupby(level="task"))), NOVEL)
+                   f"with novel ones: {signed(interval.value)} points{told}; by themselves {each}", points(interval),
+                   jointly(*map(judged, own.values())), NOVEL)
