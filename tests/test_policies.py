@@ -314,14 +314,17 @@ def test_every_gradient_step_has_the_rate_of_the_schedule():
 
 def test_of_equally_good_checkpoints_the_first_is_chosen():
     weight, scores = torch.nn.Parameter(torch.zeros(())), [0.2, 0.5, 0.5, 0.1]
-    settings, met = ImitateConfig(iterations=4, eval_every=1), []
+    settings, met, optimizer = ImitateConfig(iterations=4, eval_every=1), [], torch.optim.SGD([weight], lr=1.0)
+
+    def step():
+        optimizer.step()
+        return {"loss": torch.zeros(())}
 
     def candidate():
         met.append(len(met))
         return met[-1], {"success_once": scores[met[-1]]}
 
-    chosen, _ = best_checkpoint(settings, lambda: {"loss": torch.zeros(())}, torch.optim.SGD([weight], lr=1.0), Average([weight], 0.0),
-                                candidate, None)
+    chosen, _ = best_checkpoint(settings, step, optimizer, Average([weight], 0.0), candidate, None)
     assert chosen == 1 and met == [0, 1, 2, 3]
 
 
