@@ -156,29 +156,30 @@ def sections(claims: pd.DataFrame, tables: dict[str, pd.DataFrame], folder: Path
         shown = [page.details(f"{len(table)} rows", page.table(rows)),
                  page.details("How to make them again", page.code("\n".join(again)))]
         tasks = dict.fromkeys(table["task"]) if "task" in table else ()
-        pictures = [(folder / f"{picture_of(name, task, table)}.png", task) for task in tasks]
-        drawn = [page.figure(path, f"{name}.csv, {task}") for path, task in pictures if path.exists()]
+        paths = [(folder / f"{picture_of(name, task, table)}.png", task) for task in tasks]
+        drawn = [page.figure(path, f"{name}.csv, {task}") for path, task in paths if path.exists()]
         parts.append(page.Section(f"Recorded: {name}", drawn + shown))
     return parts
 
 
-def _range(tables: dict[str, pd.DataFrame]) -> Picture:
-    jobs, bets = (of_these_objects(tables.get(name, pd.DataFrame())) for name in ("main_job", "bet_bases"))
-    tasks = task_range.by_task(task_range.over_bets(jobs, bets))
+def _rows(tables: Mapping[str, pd.DataFrame], *names: str) -> list[pd.DataFrame]:
+    """The records of these names, on the objects that are set now; an empty one for each that is not there."""
+    return [of_these_objects(tables.get(name, pd.DataFrame(columns=["task", "recipe"]))) for name in names]
+
+
+def _range(tables: Mapping[str, pd.DataFrame]) -> Picture:
+    tasks = task_range.by_task(task_range.over_bets(*_rows(tables, "main_job", "bet_bases")))
     return plots_range.range_figure(tasks, task_range.averages(tasks), "Base policies and decorated ones, best evaluation of a run")
 
 
 def pictures(tables: Mapping[str, pd.DataFrame]) -> Iterator[tuple[str, Picture]]:
     """The pictures of several records, by their names in data/results; those of which nothing is recorded are left out."""
-    def rows(name: str) -> pd.DataFrame:
-        return of_these_objects(tables.get(name, pd.DataFrame(columns=["task", "recipe"])))
-
     if "main_job" in tables:
         yield "all_tasks", _range(tables)
-    beside = task_range.beside_imitation(*map(rows, ("main_job", "longer_imitation", "over_longer_imitation")))
+    beside = task_range.beside_imitation(*_rows(tables, "main_job", "longer_imitation", "over_longer_imitation"))
     if len(beside):
         yield "beside_imitation", plots_range.beside_imitation_figure(beside, "What imitation alone comes to, and what decoration does")
-    sampled = task_range.over_diffusion({name: rows(name) for name in task_range.DIFFUSION})
+    sampled = task_range.over_diffusion(dict(zip(task_range.DIFFUSION, _rows(tables, *task_range.DIFFUSION), strict=True)))
     if len(sampled):
         yield "over_diffusion", plots_range.over_diffusion_figure(sampled)
 

@@ -214,12 +214,12 @@ def _() -> Finding:
     tasks. (Their mean was judged first, with "reproduced", though one of the two shows no gap. How hard a task is without novel objects,
     the paper's other reason, is not asked.)"""
     runs = recorded("object_gap")[0]
-    own = runs.task.str.endswith("Source")
+    source = runs.task.str.endswith("Source")
     runs = runs.assign(task=runs.task.str.removesuffix("Source"))
-    shown, novel = (by_seed(rows, "mlp", "base_success") for rows in (runs[own], runs[~own]))
+    shown, novel = (by_seed(rows, "mlp", "base_success") for rows in (runs[source], runs[~source]))
     interval, values, (first, second), told = set_apart(shown, novel, NOVEL)
-    own = {task: mean_interval(mine) for task, mine in values.groupby(level="task")}
-    each = ", ".join(f"{task} {points(gap)}" for task, gap in own.items())
+    gaps = {task: mean_interval(mine) for task, mine in values.groupby(level="task")}
+    each = ", ".join(f"{task} {points(gap)}" for task, gap in gaps.items())
     return finding("object_gap", values, f"base policies solve {percent(first)} with the demonstrations' objects and {percent(second)} "
                    f"with novel ones: {signed(interval.value)} points{told}; by themselves {each}", points(interval),
-                   jointly(*map(judged, own.values())), NOVEL)
+                   jointly(*map(judged, gaps.values())), NOVEL)
