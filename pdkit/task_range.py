@@ -68,14 +68,14 @@ def beside_imitation(jobs: pd.DataFrame, longer: pd.DataFrame, over: pd.DataFram
 
     Columns: task, base, base_low, base_high, decorated, low, high, seeds (of the main job: as in `by_task`); of the longer imitation
     imitated (mean over seeds), imitated_low, imitated_high (Student's t), imitated_seeds; and the same of over_longer_imitation.csv, the
-    decorator over one of these policies, as over_... (NaN where it has not ENOUGH seeds). Tasks that `jobs` has not, or of which the
-    longer imitation has not ENOUGH seeds, are left out.
+    main job's recipe over one of these policies, as over_... (NaN where it has not ENOUGH seeds). Tasks that `jobs` has not, or of
+    which the longer imitation has not ENOUGH seeds, are left out.
     """
     columns = ["task", "base", "base_low", "base_high", "decorated", "low", "high", "seeds",
                *(f"{what}{part}" for what in ("imitated", "over") for part in ("", "_low", "_high", "_seeds"))]
     rows = []
     for task in (task for suite in reversed(SUITES) for task in TASKS[suite]):
-        job, alone, above = (table[table.task == task] for table in (jobs, longer, over))
+        job, alone, above = (table[table.task == task] for table in (jobs, longer, over[over.recipe == "lesson"]))
         if len(job) and len(alone) >= ENOUGH:
             rows.append({"task": task} | _results(job) | _over_seeds("imitated", alone, "base_success")
                         | (_over_seeds("over", above, "decorated_success") if len(above) >= ENOUGH else {}))

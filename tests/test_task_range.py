@@ -82,7 +82,9 @@ def test_longer_imitation_beside_decoration(tasks):
                               decorated_success_at_end=0) for task in ("Door", "Pen") for seed, end in enumerate((0.9, 0.95, 1.0))])
     longer = pd.DataFrame([dict(task=task, seed=seed, base_success=end)
                            for task in ("Pen", "Hammer") for seed, end in enumerate((0.6, 0.7, 0.8))])
-    over = pd.DataFrame([dict(task="Pen", seed=seed, base_success=0.6, decorated_success=end) for seed, end in enumerate((0.8, 0.9, 1.0))])
+    over = pd.DataFrame([dict(task="Pen", recipe=recipe, seed=seed, base_success=0.6, decorated_success=end)
+                         for recipe, ends in (("lesson", (0.8, 0.9, 1.0)), ("alpha=0.03", (0.1, 0.2, 0.3)))
+                         for seed, end in enumerate(ends)])
     (row,) = task_range.beside_imitation(jobs, longer, over).to_dict("records")
     half = 4.302653 * 0.1 / np.sqrt(3)  # Student's t over three seeds
     assert (row["task"], row["base"], row["imitated_seeds"]) == ("Pen", 0.5, 3) and row["imitated"] == pytest.approx(0.7)
