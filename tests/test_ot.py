@@ -7,10 +7,12 @@ import pytest
 import torch
 from worlds import clone, reach_demos, reach_trainer
 
+from pdkit.claims import TASKS
 from pdkit.decorated import Decorated, load_decorated, save_decorated
 from pdkit.errors import PdkitError
 from pdkit.evaluate import evaluate
 from pdkit.imitate import Windows
+from pdkit.methods.registry import method_config
 from pdkit.methods.transport import as_trained
 from pdkit.online_config import OnlineConfig
 from pdkit.policies import VINN, BeTForSAC
@@ -177,6 +179,14 @@ def test_demonstrations_end_as_training_episodes_do():
     assert length(on_success="terminate") == solved
     assert [length(on_success="continue", success_tail=tail) for tail in (0, 2, 20)] == [solved + 4, solved + 2, solved + 4]
     assert length(on_success="continue", success_tail=0, train_limit=2) == 2
+
+
+@pytest.mark.parametrize("task", [task for tasks in TASKS.values() for task in tasks])
+@pytest.mark.parametrize("method", ["rot", "fish"])
+def test_a_solved_episode_of_a_lesson_is_as_long_as_any_other(method, task):
+    """Its mass is 1, so a step of a shorter one would weigh more: success would be rewarded or punished."""
+    config = method_config(method, task, "lesson", 0)
+    assert (config.on_success, config.success_tail) == ("continue", 0)
 
 
 # ---- rows of whole episodes ------------------------------------------------------------------------------------------

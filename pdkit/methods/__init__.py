@@ -35,8 +35,9 @@ _OWN_POLICY = dict(alpha=1.0, alpha_scale=(), H=0, residual_penalty=0.0)
 # many updates a step, bring it near a decorator's run (data/results/leaderboard.csv: updates, train_minutes).
 _TRANSFORMER = dict(batch=64, utd=0.125)
 
-# In the lesson: under a reward by likeness an end at success would itself be a reward (pdkit/methods/transport.py), on whatever task.
-_LIKENESS = dict(on_success="continue")
+# In the lesson: under a reward by likeness an end at success would itself be a reward, and a cut soon after it a price
+# (pdkit/methods/transport.py), on whatever task.
+_LIKENESS = dict(on_success="continue", success_tail=0)
 
 # A U-Net with adapters, which also denoises in four steps for every target, so an update is slow: there are fewer, each with half of the
 # original's steps in actions. Not tuned; recorded in data/results/diffusion_finetuning.csv (notebook 12).

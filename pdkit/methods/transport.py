@@ -1,9 +1,10 @@
 """What ROT and FISH share: the reward by optimal transport (pdkit/rl/ot.py) in the place of success.
 
 Success is no reward. But where it ends training episodes (on_success="terminate", the paper profile), it is worth reaching all the
-same, because every further step costs: on the reach probe a constant negative reward then teaches as much as transport does. With
-on_success="continue" (the lesson profile of both, on every task) an episode ends as by a time limit and transport alone teaches. Rows
-reach the replay when their episode is over.
+same, because every further step costs: on the reach probe a constant negative reward then teaches as much as transport does. Where it
+cuts them, as by a time limit (a success_tail), it costs: an episode's mass is 1, so each step of a short one weighs more. With
+on_success="continue" and success_tail=0 (the lesson profile of both, on every task; the originals' episodes are all of one length, too)
+every episode lasts to the limit and transport alone teaches. Rows reach the replay when their episode is over.
 """
 from __future__ import annotations
 
