@@ -114,7 +114,8 @@ def difference_interval(gained: int, lost: int, n: int, confidence: float = 0.95
     """(gained - lost) / n with Tango's score interval for paired proportions (Statistics in Medicine 17, 1998, 891).
 
     The limits are the differences d at which the score test of "the true difference is d" has p = 1 - confidence. At
-    d = 0 that test is McNemar's, so the interval and the test tell the same story.
+    d = 0 that test is McNemar's by its normal approximation; `mcnemar` is exact and stricter where few disagree: of 60 pairs with 4 gained
+    and none lost the interval leaves out 0, with p = 0.125.
     """
     z = _z(confidence)
 

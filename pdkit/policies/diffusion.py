@@ -5,8 +5,9 @@
                that begin at the latest observation are executed, then the policy looks again
 
 With prediction="v_prediction" (Salimans and Ho, 2022; not in the paper) the network gives v = sqrt(abar_k) eps - sqrt(1 - abar_k) a
-instead, from which both follow. Where all is noise that is the action itself; a network that must give the noise there has to pass
-its own input on through every layer to a high accuracy, which should take it more gradient steps (lesson 03 lets one compare).
+instead, from which both follow. Where all is noise that is the action itself, but for its sign; a network that must give the noise
+there has to pass its own input on through every layer to a high accuracy, which should take it more gradient steps (lesson 03 lets one
+compare).
 
 With action_limits what is noised are actions that run from -1 to 1 between the least and the greatest that was demonstrated, for each
 number by itself, as the original does it by default (Chi et al.'s LinearNormalizer); the official code takes them as they are. A number

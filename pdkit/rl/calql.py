@@ -7,9 +7,11 @@
     target     y = reward + discount * max_k min_i Qbar_i(s', a'_k),          no entropy
 
 The term pushes down what actions outside the data promise; V, the Monte-Carlo return of the data at s, stops that for the policy's
-actions (without the max it is CQL, whose values fall far below any real return and are unlearned online). Random actions are not
-bounded. c stands for the scale of the rewards: with c = 10 this is, up to a factor that Adam ignores, the loss for rewards of -10 and
-0 in place of the loop's -1 and 0. The original has -5 and, once, 5: as far apart, but a step's delay costs half as much.
+actions (without the max it is CQL, whose values fall far below any real return and are unlearned online). Q of random actions has no
+such floor, and none of them lies where a BeT for SAC may go beyond [-1, 1] (dimensions it scales). With n-step rows s' is the state n
+steps on, in both places. c stands for the scale of the rewards: with c = 10 this is, up to a factor that Adam ignores, the loss for
+rewards of -10 and 0 in place of the loop's -1 and 0. The original has -5 and, once, 5: as far apart, but a step's delay costs half as
+much.
 """
 from __future__ import annotations
 
