@@ -2,19 +2,26 @@
 a bound allows (13)."""
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import matplotlib as mpl
 import numpy as np
 import pandas as pd
 from matplotlib.lines import Line2D
 
 from .plots import COLORS, PALETTE, Picture, _columns, blank, styled
-from .task_range import PAPER_DIFFUSION, averages
+from .task_range import COLD, PAPER_DIFFUSION, averages
+
+NAMES = {"maniskill": " ManiSkill", "adroit": " Adroit"}  # of suites
 
 
 @styled
-def range_figure(tasks: pd.DataFrame, means: pd.DataFrame, title: str = "", paper: str = "four tasks") -> Picture:
+def range_figure(tasks: pd.DataFrame, means: pd.DataFrame, title: str = "", paper: str = "four tasks",
+                 notes: Mapping[str, str] | None = None) -> Picture:
     """Rows of `task_range.by_task`, an arrow from base to decorated success with intervals; below the tasks of a suite the mean, and
-    the paper's (over which tasks: `paper`) as open marks. Where `means` has no row a suite, one group of all tasks."""
+    the paper's (over which tasks: `paper`) as open marks. Where `means` has no row a suite, one group of all tasks. `notes`: what
+    stands behind a task's number of seeds."""
+    notes = notes or {}
     _columns(tasks, "task", "suite", "base", "decorated", "low", "high", "seeds")
     lines, y = [], 0.0
     groups = tasks.suite if tasks.suite.isin(means.over).all() else tasks.suite.map(lambda _: "all")
@@ -28,13 +35,13 @@ def range_figure(tasks: pd.DataFrame, means: pd.DataFrame, title: str = "", pape
     for at, row in lines:
         if hasattr(row, "task"):
             seeds = "not recorded" if not row.seeds else f"{row.seeds} seed{'s' if row.seeds > 1 else ''}"
-            labels[at] = f"{row.task} ({seeds})"
+            labels[at] = f"{row.task} ({seeds}{notes.get(row.task, '')})"
             if row.seeds:
                 _way(ax, at, row.base, row.decorated)
                 for low, high, color, aside in ((row.base_low, row.base_high, "base", -0.09), (row.low, row.high, "decorated", 0.09)):
                     ax.plot([low, high], [at + aside, at + aside], color=COLORS[color], lw=5, alpha=0.25, solid_capstyle="butt", zorder=1)
         else:
-            labels[at] = f"mean, {row.tasks} tasks"
+            labels[at] = f"mean, {row.tasks}{NAMES.get(row.over, '')} tasks"
             if np.isfinite(row.decorated):
                 _way(ax, at, row.base, row.decorated, "D")
             ax.plot(row.paper_base, at, "s", ms=8, mfc="none", color=COLORS["base"])
@@ -56,7 +63,8 @@ def range_figure(tasks: pd.DataFrame, means: pd.DataFrame, title: str = "", pape
 def over_diffusion_figure(tasks: pd.DataFrame) -> Picture:
     """The same of `task_range.over_diffusion`."""
     return range_figure(tasks, averages(tasks, {"all": PAPER_DIFFUSION}), "Over a Diffusion Policy, the last policy of a run",
-                        "what seem to be six tasks, not named")
+                        "what seem to be six tasks, not named",
+                        {task: f"; from {share:g} of the noise" for task, share in COLD.items()})
 
 
 @styled
@@ -66,8 +74,8 @@ def beside_imitation_figure(tasks: pd.DataFrame, title: str = "") -> Picture:
     _columns(tasks, "task", "base", "decorated", "imitated", "over")
     figure, axes = blank(size=(8.2, 1.5 + 0.46 * len(tasks)))
     ax, marks = axes[0, 0], []
-    kinds = (("base policy", "base", "o", COLORS["base"]), ("it decorated", "decorated", "o", COLORS["decorated"]),
-             ("longer imitation", "imitated", "D", PALETTE[2]), ("that decorated", "over", "D", PALETTE[4]))
+    kinds = (("base policy", "base", "o", COLORS["base"]), ("the base, decorated", "decorated", "o", COLORS["decorated"]),
+             ("longer imitation", "imitated", "D", PALETTE[2]), ("that, decorated", "over", "D", PALETTE[4]))
     for place, (name, column, marker, color) in enumerate(kinds):
         low, high, seeds = ("low", "high", "seeds") if column == "decorated" else (f"{column}_{end}" for end in ("low", "high", "seeds"))
         y = np.arange(len(tasks)) + 0.2 * place - 0.3

@@ -26,6 +26,7 @@ from pathlib import Path
 import pandas as pd
 
 from . import page, plots_range, task_range, verdicts
+from .claims import BETS
 from .cli import Parser
 from .errors import PdkitError
 from .files import DATA, TEMPORARY, atomic_file, runs_root
@@ -169,7 +170,8 @@ def _rows(tables: Mapping[str, pd.DataFrame], *names: str) -> list[pd.DataFrame]
 
 def _range(tables: Mapping[str, pd.DataFrame]) -> Picture:
     tasks = task_range.by_task(task_range.over_bets(*_rows(tables, "main_job", "bet_bases")))
-    return plots_range.range_figure(tasks, task_range.averages(tasks), "Base policies and decorated ones, best evaluation of a run")
+    bases = "Behavior Transformers" if tasks.policy.dropna().isin(BETS).all() else "base policies"
+    return plots_range.range_figure(tasks, task_range.averages(tasks), f"Over {bases}, the best evaluation of a run")
 
 
 def pictures(tables: Mapping[str, pd.DataFrame]) -> Iterator[tuple[str, Picture]]:

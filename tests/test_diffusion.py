@@ -216,7 +216,7 @@ def test_the_samplers_own_noise_comes_from_the_cpus_generator(monkeypatch):
 
 
 @pytest.mark.parametrize(("changes", "message"), [
-    (dict(horizon=7), "multiple of 2"), (dict(chunk=8), "fit between"), (dict(chunk=0), "at least 1"),
+    (dict(horizon=7), "multiple of 2"), (dict(chunk=8), r"must be 1 to \d+ here, from the latest"), (dict(chunk=0), "at least 1"),
     (dict(dims=[10, 32]), "multiples of"), (dict(sampler="euler"), "Unknown sampler"), (dict(prediction="x"), "Unknown prediction"),
     (dict(spacing="x"), "Unknown spacing"), (dict(obs_encoder=[8, 0]), "at least"), (dict(obs_encoder=[0.5]), "whole numbers"),
     (dict(obs_encoder=8), "a list"),

@@ -167,6 +167,11 @@ def test_results_on_ones_own_objects_are_not_mixed_with_those_on_generated_ones(
         theirs, = make_jobs(load_spec(spec))
     monkeypatch.delenv(VARIABLE)
     assert sources.scripted("TurnFaucetSource", 1).extra == {} and object_set(get_task("TurnFaucet")) == ""
+    monkeypatch.setenv(VARIABLE, str(tmp_path / "typo"))
+    with pytest.raises(PdkitError, match="which is not a folder"):  # at once, not when a training first simulates
+        sources.bundled("TurnFaucet")
+    assert object_set(get_task("Door")) == ""
+    monkeypatch.delenv(VARIABLE)
     assert recorded.load("x")[0].set_index(["task", "recipe"]).success.to_dict() == {
         ("TurnFaucet", "lesson"): 0.5, ("Door", "lesson"): 0.9}
     ours, = make_jobs(load_spec(spec))

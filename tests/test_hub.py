@@ -176,6 +176,8 @@ def test_a_file_of_the_user_s_is_never_deleted(tmp_path, monkeypatch):
     with pytest.raises(PdkitError):
         hub.from_hub("StackCube", 1, mine)
     assert mine.read_text() == "no trajectory"
+    with pytest.raises(PdkitError, match="mine.txt is neither a .zip nor an .h5; --from takes"):
+        hub.from_hub("StackCube", 1, mine.rename(mine.with_suffix(".txt")))
 
 
 def test_the_archive_is_fetched_once(copied, tmp_path, monkeypatch):

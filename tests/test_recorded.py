@@ -55,8 +55,9 @@ def test_a_notebooks_numbered_columns_become_rows():
 
 def test_the_picture_shows_every_policy_that_methods_start_from():
     """A comparison of methods has several: the first row's alone would stand for all."""
-    rows = pd.DataFrame({"task": "Door", "recipe": ["a", "a", "b", "b"], "policy": ["bet", "bet", "vinn", "vinn"], "seed": [0, 1, 0, 1],
-                         "episodes": 60, "base_success": [0.5, 0.5, 0.9, 0.9], "decorated_success": [0.7, 0.8, 0.1, 0.2]})
+    rows = pd.DataFrame({"task": "Door", "recipe": ["a", "a", "b", "b", "c"], "policy": ["bet", "bet", "vinn", "vinn", "bet"],
+                         "seed": [0, 1, 0, 1, 0], "episodes": 60, "base_success": [0.5, 0.5, 0.9, 0.9, 0.5],
+                         "decorated_success": [0.7, 0.8, 0.1, 0.2, 0.0]})
     curves = rows[["task", "recipe", "seed"]].assign(step=1_000, success_once=0.6)
     for table, expected in ((rows, {"base (bet)": 0.5, "base (vinn)": 0.9, "a": 0.75, "b": 0.15}),
                             (rows[rows.recipe == "a"].assign(recipe=["x", "y"]), {"base": 0.5})):
@@ -77,6 +78,10 @@ def test_recipes_that_start_from_different_successes_show_each_its_own():
     ticks = {names[round(sum(line.get_ydata()) / 2)]: line.get_xdata()[0] / 100 for line in right.lines if line.get_color() == "0.4"}
     assert ticks == {"a": 0.5, "b": 0.9} and names == ["b", "a"]  # from below: the better one is on top
     assert not [line for line in left.lines if line.get_linestyle() == "--"]
+    starts = {line.get_color(): line.get_ydata()[0] / 100 for line in left.lines if line.get_marker() == "s"}
+    assert starts == {line.get_color(): 0.5 if line.get_label() == "a" else 0.9 for line in left.lines if line.get_label() in "ab"}
+    own = rows.assign(policy=["mlp", "mlp", "rnn", "rnn"])  # each over a kind of policy of its own
+    assert [label.get_text() for label in figure(own, pd.DataFrame(columns=["task", "recipe", "seed"])).axes[1].get_yticklabels()] == names
 
 
 def test_only_recipes_whose_kind_of_policy_has_several_starts_have_ticks():

@@ -171,7 +171,7 @@ def test_a_diffusion_policy_samples_as_asked_and_others_do_not(tmp_path, monkeyp
     assert cli.main([*named, "temperature=0.5"]) == 2 and "holds reach's 'mine'" in capsys.readouterr().err
     assert "base" in table.index
     capsys.readouterr()
-    for asked, told in (("horizon=8", "Unknown sampling"), ("temperature", "--sampling takes NAME=VALUE"), ("chunk=9", "fit between"),
+    for asked, told in (("horizon=8", "Unknown sampling"), ("temperature", "--sampling takes NAME=VALUE"), ("chunk=9", "must be 1 to"),
                         ("chunk=1 --oracle 0", "leave --sampling out")):
         assert cli.main([*words, "--sampling", *asked.split()]) == 2
         assert told in capsys.readouterr().err

@@ -94,7 +94,10 @@ def _trajectory_file(spec: TaskSpec, given: Path | None) -> Path:
     """The .h5 file to read: the one given, or that of the hub's archive, which is unpacked into runs/hub unless it is there already."""
     if given and not given.is_file():
         raise PdkitError(f"{given} does not exist; --from takes the hub's .zip, or a trajectory.h5 with its trajectory.json beside it.")
-    if given and given.suffix != ".zip":
+    if given and given.suffix not in (".zip", ".h5"):
+        raise PdkitError(f"{given} is neither a .zip nor an .h5; --from takes the hub's .zip, or a trajectory.h5 with its trajectory.json "
+                         "beside it.")
+    if given and given.suffix == ".h5":
         return given
     # An archive that was given is kept apart from the hub's own: what it holds is anybody's.
     folder = runs_root() / "hub" / (f"{spec.make.env_id}-{sha256(given)[:12]}" if given else spec.make.env_id)

@@ -103,8 +103,9 @@ class DiffusionPolicy(Policy):
             raise PdkitError(f"Diffusion Policy's horizon ({self.horizon}) must be a multiple of {shortest}: its U-Net halves the time "
                              f"{len(c['dims']) - 1} times.")
         if not 1 <= self.chunk <= self.horizon - self.window + 1:
-            raise PdkitError(f"Diffusion Policy's chunk ({self.chunk}) must be at least 1 and fit between the latest of {self.window} "
-                             f"observations and the horizon ({self.horizon}).")
+            raise PdkitError(f"Diffusion Policy's chunk ({self.chunk}) must be 1 to {self.horizon - self.window + 1} here, from the latest "
+                             f"of {self.window} observations to the end of the horizon ({self.horizon}); a longer horizon, or window=1, "
+                             "leaves room for more.")
         if c["kernel"] % 2 != 1 or c["embed"] % 2:
             raise PdkitError(f"Diffusion Policy's kernel must be odd, so that its U-Net keeps the time's length, and embed even, for sines "
                              f"and cosines, not {c['kernel']} and {c['embed']}.")

@@ -48,6 +48,12 @@ def partnet_models(ids: Sequence[int]) -> list[Model] | None:
 
     Raises PdkitError where the folder, an object or one of its meshes is missing, or a description is not readable.
     """
+    folder = _folder()
+    return None if folder is None else [_model(folder, str(one)) for one in ids]
+
+
+def _folder() -> Path | None:
+    """The user's PartNet-Mobility folder, None where none is named. Raises PdkitError where what is named is no folder."""
     named = os.environ.get(VARIABLE)
     if not named:
         return None
@@ -55,13 +61,13 @@ def partnet_models(ids: Sequence[int]) -> list[Model] | None:
     if not folder.is_dir():
         raise PdkitError(f"{VARIABLE} names {folder}, which is not a folder; let it name the folder with the PartNet-Mobility objects, "
                          "or unset it to use generated objects.")
-    return [_model(folder, str(one)) for one in ids]
+    return folder
 
 
 def object_set(spec: TaskSpec) -> str:
     """What results must not be mixed over: "PartNet-Mobility" where a task's objects are the user's own now; "" for generated ones, and
-    for a task without."""
-    return "PartNet-Mobility" if spec.own_objects and os.environ.get(VARIABLE) else ""
+    for a task without. Raises PdkitError where PDKIT_PARTNET names no folder."""
+    return "PartNet-Mobility" if spec.own_objects and _folder() else ""
 
 
 def _model(folder: Path, name: str) -> Model:
