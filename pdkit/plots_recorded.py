@@ -54,7 +54,7 @@ def figure(table: pd.DataFrame, curves: pd.DataFrame, task: str = "Door") -> Fig
         left.axhline(100 * value, color="0.4", ls="--", lw=1, label="base policy")
     left.set(xlabel="environment steps (thousands)", ylabel="success within the episode (%)", ylim=(0, 102),
              title=f"{task}: evaluations during training" + " (colours: right)" * several)
-    left.xaxis.set_major_locator(MaxNLocator(8, integer=True))
+    left.xaxis.set_major_locator(MaxNLocator(8, integer=True, steps=[1, 2, 5, 10]))
     if not several:
         left.legend(fontsize=8, loc="best")
     for y, (name, values, color, count) in enumerate(reversed(bars)):

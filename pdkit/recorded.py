@@ -61,14 +61,24 @@ def record(name: str, rows: pd.DataFrame, curves: pd.DataFrame, settings: Mappin
         path = folder / f"{name}_manifest.json"
         write_json(path, {"written": time.strftime("%Y-%m-%d"), "machines": _machines(path), "again": sorted(set(again))}
                    | ({SETTINGS: known} if known else {}))
-        if len(tables) < 2 or not {"base_success", "decorated_success"} <= set(tables[0]):
-            return
-        from .plots import save_small  # matplotlib, which a training has no other need of
-        from .plots_recorded import figure
+        if len(tables) == 2:
+            draw(name)
 
-        for task in dict.fromkeys(tables[0].task):  # all: which is the first may have changed
-            with atomic_file(folder / f"{picture_of(name, task, tables[0])}.png") as temporary:
-                save_small(figure(*tables, task), temporary)
+
+def draw(name: str) -> None:
+    """Draw the pictures of a record of trainings, one a task (`picture_of`); none of another record."""
+    from .plots import save_small  # matplotlib, which a training has no other need of
+    from .plots_recorded import figure
+
+    paths = [DATA / "results" / f"{name}{end}.csv" for end in ("", "_curves")]
+    if not all(path.exists() for path in paths):
+        return
+    tables = [pd.read_csv(path, **AS_WORDS) for path in paths]
+    if not {"base_success", "decorated_success"} <= set(tables[0]):
+        return
+    for task in dict.fromkeys(tables[0].task):  # all: which is the first may have changed
+        with atomic_file(DATA / "results" / f"{picture_of(name, task, tables[0])}.png") as temporary:
+            save_small(figure(*tables, task), temporary)
 
 
 def picture_of(name: str, task: str, table: pd.DataFrame) -> str:

@@ -31,7 +31,7 @@ from .cli import Parser
 from .errors import PdkitError
 from .files import DATA, TEMPORARY, atomic_file, runs_root
 from .plots import Picture, save_small
-from .recorded import AS_WORDS, KEYS, mixed, of_these_objects, picture_of, settings_of
+from .recorded import AS_WORDS, KEYS, draw, mixed, of_these_objects, picture_of, settings_of
 
 COLUMNS = ["claim", "section", "tasks", "seeds", "measured", "interval", "verdict", "command"]
 VERDICTS = {"reproduced": "what the paper says was found", "partly": "found in part, or not yet with certainty",
@@ -190,7 +190,8 @@ def main(argv: list[str]) -> int:
     """`pdkit report [--update] [--out FILE]`; 1 when something in the claims or the tables is wrong, which is then listed."""
     parser = Parser(prog="pdkit report", description="List the paper's claims with what was measured, and write a page.")
     parser.add_argument("--out", help="the page (default: runs/report.html)")
-    parser.add_argument("--update", action="store_true", help="write the verdicts into data/results/claims.csv that its tables support")
+    parser.add_argument("--update", action="store_true", help="write the verdicts that data/results supports into its claims.csv, and draw "
+                                                               "its pictures")
     args = parser.parse_args(argv)
     folder = DATA / "results"
     if args.update:
@@ -205,6 +206,8 @@ def main(argv: list[str]) -> int:
         print(*problems, sep="\n", file=sys.stderr)
         return 1
     if args.update:
+        for name in tables:
+            draw(name)
         for name, picture in pictures(tables):
             with atomic_file(folder / f"{name}.png") as temporary:
                 save_small(picture, temporary)

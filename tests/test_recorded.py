@@ -128,6 +128,19 @@ def test_counts_are_kept_to_the_last_digit_where_some_rows_lack_them(results):
     assert "1234567" in written and "0.123457" in written and "0.1234567" not in written
 
 
+def test_the_pictures_of_a_record_are_drawn_again_from_its_tables(results):
+    """A picture a task, the first under the record's name; none of what has no trainings."""
+    rows = pd.DataFrame({"task": ["Pen", "Hammer"], "recipe": "7", "seed": 0, "episodes": 60, "base_success": 0.5, "decorated_success": 0.6,
+                         "command": "pdkit x"})
+    recorded.record("x", rows, rows[["task", "recipe", "seed"]].assign(step=1_000, success_once=0.6))
+    recorded.record("y", rows.drop(columns="base_success"), pd.DataFrame())
+    for path in results.glob("*.png"):
+        path.unlink()
+    for name in ("x", "y", "absent"):
+        recorded.draw(name)
+    assert {path.name for path in results.glob("*.png")} == {"x.png", "x-Pen.png"}
+
+
 def test_runs_without_evaluations_can_be_drawn():
     table = pd.DataFrame([{"task": "Door", "recipe": "x", "seed": s, "base_success": 0.5, "decorated_success": 0.6, "episodes": n}
                           for s, n in ((0, 1_000), (1, 20))])

@@ -4,6 +4,7 @@ import pandas as pd
 import pytest
 
 from pdkit import plots_diffusion, plots_range, task_range
+from pdkit.files import DATA
 from pdkit.stats import wilson
 
 
@@ -74,6 +75,16 @@ def test_what_is_recorded_over_a_diffusion_policy(results):
     assert figure.legends[0].get_texts()[-1].get_text() == "the paper's mean, what seem to be six tasks, not named"
     assert [label.get_text() for label in ax.get_yticklabels()] == ["StackCube (2 seeds)", "mean, 1 of 1 tasks"]
     assert [float(np.ravel(line.get_xdata())[0]) for line in ax.lines if line.get_marker() == "s"] == pytest.approx([0.5255, 0.999])
+
+
+def test_the_table_of_diffusion_policies_is_what_is_recorded():
+    told, rows = (DATA / "RESULTS.md").read_text(), task_range.over_diffusion()
+    for r in rows.itertuples():
+        start, end = (f"{100 * value:.0f} % ({100 * low:.0f} to {100 * high:.0f})"
+                      for value, low, high in ((r.base, r.base_low, r.base_high), (r.decorated, r.low, r.high)))
+        ways = f"{r.demos}, {r.label.replace('other objects', 'of other')}"
+        assert f"| {ways}" in told and f" | {start} | {end} | {100 * r.at_end:.0f} % | {round(r.env_steps, -3):,} |" in told, r.task
+    assert f"| {100 * rows.base.mean():.1f} % | {100 * rows.decorated.mean():.1f} % |" in told
 
 
 def test_longer_imitation_beside_decoration(tasks):
