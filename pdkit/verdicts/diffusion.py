@@ -14,6 +14,7 @@ import pandas as pd
 
 from ..claims import (
     DECORATOR,
+    FLOOR,
     LEAST_SEEDS,
     NEARLY,
     TASKS,
@@ -94,38 +95,47 @@ def _() -> Finding:
 
 @measures("The best baseline that fine-tunes Diffusion Policy")
 def _() -> Finding:
-    """None of its seeds solves a test episode."""
+    """None of its seeds solves a test episode; "partly" where next to none does on average (FLOOR; of after the runs, as one seed with 3
+    episodes of 60 would otherwise make it "not")."""
     records, table, _ = _recorded()
     rival = best(table, TUNED)
     values = by_seed(table, rival, "decorated_success")
     told = f"{rival} {percent(values.mean())}; largest of its seeds {percent(values.max())}{besides(table, BESIDES)}"
-    return finding(records, values, told,
-                   points(mean_interval(values)), "reproduced" if values.max() == 0 else "not", TASKS["maniskill"] + TASKS["adroit"])
+    verdict = "reproduced" if values.max() == 0 else "partly" if average(values) < FLOOR else "not"
+    return finding(records, values, told, points(mean_interval(values)), verdict, TASKS["maniskill"] + TASKS["adroit"])
 
 
 @measures("Policy Decorator on DPPO's own diffusion checkpoints")
 def _() -> Finding:
     """Nothing was run from those checkpoints, so nothing is judged. (At first the kit's own stood for them, and the verdict was "partly",
-    then "not".) What was found over the kit's own is told, against the better of DPPO's recorded settings, as the paper's was carefully
-    tuned."""
+    then "not".) What was found over the kit's own is told, against the better of DPPO's recorded settings on each task, as the paper's was
+    carefully tuned."""
     records, table, cells = _recorded()
-    rival = best(table, BESIDES)
-    one, two = (by_seed(table, recipe, "decorated_success") for recipe in (DECORATOR, rival))
-    found = set_against(records, one, two, (DECORATOR, rival))
+    runs, name, others = _dppo(table)
+    mine, theirs = (by_seed(rows, recipe, "decorated_success") for rows, recipe in ((table, DECORATOR), (runs, "dppo")))
+    found = set_against(records, mine, theirs, (DECORATOR, name))
     raise TooLittle(f"The kit has neither these checkpoints nor these tasks. Over its own Diffusion Policies ({found.tasks}): "
-                    f"{found.measured}, {found.interval}{cells}{_others(table, rival)}.")
+                    f"{found.measured}, {found.interval}{cells}{others}.")
 
 
 @measures("DPPO successfully fine-tunes")
 def _() -> Finding:
-    """Above the policy that it started from, at the better of its recorded settings. Not the paper's tasks, nor their budget."""
+    """Above the policy that it started from, at the better of its recorded settings on each task. Not the paper's tasks, nor their
+    budget."""
     records, table, _ = _recorded()
-    rival = best(table, BESIDES)
-    end, start = (by_seed(table, rival, column) for column in ("decorated_success", "base_success"))
-    found = set_against(records, end, start, (rival, "its start"), paper=("Square", "Transport"))
-    return replace(found, measured=found.measured + _others(table, rival))
+    runs, name, others = _dppo(table)
+    end, start = (by_seed(runs, "dppo", column) for column in ("decorated_success", "base_success"))
+    found = set_against(records, end, start, (name, "its start"), paper=("Square", "Transport"))
+    return replace(found, measured=found.measured + others)
 
 
-def _others(table: pd.DataFrame, rival: str) -> str:
-    """What is told of DPPO's settings but the one that is judged."""
-    return besides(table, [recipe for recipe in BESIDES if recipe != rival])
+def _dppo(table: pd.DataFrame) -> tuple[pd.DataFrame, str, str]:
+    """DPPO's runs at the better of its recorded settings on each task, as one recipe "dppo"; which these are, and what is told of the
+    others. Raises TooLittle where there are none."""
+    runs = table[table.recipe.isin(BESIDES)]
+    better = {task: best(rows, BESIDES) for task, rows in runs.groupby("task", sort=False)}
+    if not better:
+        raise TooLittle(f"None of {', '.join(BESIDES)} is recorded with {LEAST_SEEDS} seeds.")
+    chosen, names = runs.recipe == runs.task.map(better), set(better.values())
+    name = names.pop() if len(names) == 1 else ", ".join(f"{recipe} on {task}" for task, recipe in better.items())
+    return runs[chosen].assign(recipe="dppo"), name, besides(runs[~chosen], BESIDES)
