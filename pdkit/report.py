@@ -9,7 +9,7 @@ data/results/claims.csv has a row a claim:
                                                  command   that makes the numbers again
 
 `pdkit report --update` first computes every verdict anew for which there is a rule (pdkit/verdicts) and enough is recorded, and, where
-nothing is wrong, draws the `pictures` of several records.
+nothing is wrong, draws the pictures of each record and the `pictures` of several.
 A claim whose verdict is not "untested" has all of them. The recorded tables beside it (a row a run, with its command) are checked
 too: a report on broken tables is refused.
 """

@@ -123,7 +123,7 @@ def test_the_readme_tells_how_many_claims_hold():
     text = (DATA.parent / "README.md").read_text().replace("\n  ", " ")
     assert f"{held.sum()} claims of the paper: {told}," in text
     over_0 = claims.interval[claims.verdict == "not"].str.contains(r"-[\d.]+ to \+[\d.]+ points")
-    assert f"""Of the "not" {over_0.sum()} go by their means""" in text
+    assert f"""For {over_0.sum()} of the "not" the interval of what is judged includes 0""" in text
 
 
 def test_the_claim_about_door_says_what_the_recorded_rows_say():

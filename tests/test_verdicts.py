@@ -935,8 +935,7 @@ OWN = "policy_decorator,alpha=0.03"
 
 @pytest.mark.parametrize("ends, dipo, lifts, beats, best", [
     ([0.95, 0.96, 0.97], [0.0, 0.0, 0.0], "partly", "partly", "partly"),  # as the paper says, on one of its tasks
-    ([0.95, 0.96, 0.97], [0.0, 0.1, 0.0], "partly", "partly", "partly"),  # next to none
-    ([0.95, 0.96, 0.97], [0.0, 0.2, 0.0], "partly", "partly", "not"),
+    ([0.95, 0.96, 0.97], [0.0, 0.1, 0.0], "partly", "partly", "not"),
     ([0.7, 0.72, 0.71], [0.0, 0.0, 0.0], "partly", "partly", "partly"),
     ([0.3, 0.28, 0.32], [0.6, 0.65, 0.7], "not", "not", "not")])
 def test_diffusion_policy_is_judged_by_the_cell_chosen_beforehand(results, ends, dipo, lifts, beats, best):

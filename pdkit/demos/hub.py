@@ -92,11 +92,11 @@ def from_hub(task: str, num: int, file: str | Path | None = None, progress: Call
 
 def _trajectory_file(spec: TaskSpec, given: Path | None) -> Path:
     """The .h5 file to read: the one given, or that of the hub's archive, which is unpacked into runs/hub unless it is there already."""
+    takes = "--from takes the hub's .zip, or a trajectory.h5 with its trajectory.json beside it."
     if given and not given.is_file():
-        raise PdkitError(f"{given} does not exist; --from takes the hub's .zip, or a trajectory.h5 with its trajectory.json beside it.")
+        raise PdkitError(f"{given} does not exist; {takes}")
     if given and given.suffix not in (".zip", ".h5"):
-        raise PdkitError(f"{given} is neither a .zip nor an .h5; --from takes the hub's .zip, or a trajectory.h5 with its trajectory.json "
-                         "beside it.")
+        raise PdkitError(f"{given} is neither a .zip nor an .h5; {takes}")
     if given and given.suffix == ".h5":
         return given
     # An archive that was given is kept apart from the hub's own: what it holds is anybody's.
