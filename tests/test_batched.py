@@ -1,12 +1,16 @@
 """Lanes that share one simulation: the bookkeeping against separate lanes, and ManiSkill's batched step against the fast step.
 
-ManiSkill simulates one lane on a CPU; what takes several of its lanes is in test_cuda.py.
+ManiSkill simulates one lane on a CPU. What takes several of its lanes is tested with an emulated GPU here, and on a real one in
+test_cuda.py.
 """
 import dataclasses
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
 import torch
+from emulated_gpu import emulated_gpu
+from mani_skill.utils.structs import Pose
 from test_vector import COUNT, CountSim, counting_seeds
 
 from pdkit.decorated import load_decorated
@@ -22,6 +26,8 @@ from pdkit.runs import Run
 from pdkit.seeds import selection_seeds
 from pdkit.tasks import batched, get_task
 from pdkit.tasks.batched import ManiSkillBatch, Together
+from pdkit.tasks.chair_body import chair_start
+from pdkit.tasks.faucet_env import faucet_start
 from pdkit.tasks.horizon import horizon_spec
 from pdkit.tasks.lanes import IDLE
 from pdkit.tasks.peg import peg_start
@@ -51,6 +57,7 @@ def other_simulators(monkeypatch):
     """What tests simulate with: separate simulators, and the one lane that ManiSkill simulates on a CPU."""
     monkeypatch.setitem(SIMULATORS, "side by side", side_by_side)
     monkeypatch.setitem(SIMULATORS, "stock", stock_lanes)
+    monkeypatch.setitem(SIMULATORS, "emulated GPU", lambda spec, count, rules: Together(ManiSkillBatch(spec, count), count, rules))
 
 
 def side_by_side(spec, count, rules):
@@ -142,7 +149,7 @@ def arm(stock):
     return stock._env.agent.controller.controllers["arm"].kinematics
 
 
-@pytest.mark.parametrize("task, tolerance", [("StackCube", 1e-4), ("PegInsertionSide", 5e-3)])
+@pytest.mark.parametrize("task, tolerance", [("StackCube", 1e-4), ("PegInsertionSide", 5e-3), ("TurnFaucet", 1e-4), ("PushChair", 5e-3)])
 def test_maniskills_batched_step_starts_and_moves_as_the_fast_step(task, tolerance):
     spec, rng = get_task(task), np.random.default_rng(0)
     stock, fast = ManiSkillBatch(spec, 1, "physx_cpu"), spec.make()
@@ -243,31 +250,169 @@ def test_a_restored_lane_has_the_peg_that_it_was_built_with():
     np.testing.assert_allclose(again, seen, atol=1e-3)
 
 
-def test_a_run_trains_on_the_batched_step_and_resumes(tmp_path):
-    """The whole loop on the one lane that ManiSkill simulates on a CPU."""
-    spec = get_task("StackCube")
+@pytest.mark.parametrize("task, simulator, lanes", [("StackCube", "stock", 1), ("TurnFaucet", "emulated GPU", 4),
+                                                  ("PushChair", "emulated GPU", 4)])
+def test_a_run_trains_on_the_batched_step_and_resumes(tmp_path, task, simulator, lanes):
+    """The whole loop: on the one lane that ManiSkill simulates on a CPU, and on several."""
+    spec = get_task(task)
     torch.manual_seed(0)
     base = POLICIES["mlp"](dict(obs_dim=spec.obs_dim, act_dim=spec.act_dim, hidden=8))
-    config = OnlineConfig(task="StackCube", simulator="stock", num_envs=1, env_workers=1, eval_workers=0, total_steps=120,
-                          warmup_steps=40, batch=16, utd=0.1, demo_fraction=0.0, eval_every=0, log_every=40, train_limit=30,
+    config = OnlineConfig(task=task, simulator=simulator, num_envs=lanes, env_workers=int(lanes == 1), eval_workers=0,
+                          total_steps=120, warmup_steps=40, batch=16, utd=0.1, demo_fraction=0.0, eval_every=0, log_every=40, train_limit=9,
                           checkpoint_every=50, sac=SACConfig(hidden=16, layers=2, bf16=False))
 
     def killed(trainer):
         if trainer.step >= 80:
             raise KeyboardInterrupt
 
-    with pytest.raises(KeyboardInterrupt):
-        Trainer(config, base).train(Run(tmp_path, "online", flat(config)), killed)
-    trainer = Trainer(config, base)
-    trainer.train(Run(tmp_path, "online", flat(config)))
+    with emulated_gpu() if lanes > 1 else nullcontext():
+        with pytest.raises(KeyboardInterrupt):
+            Trainer(config, base).train(Run(tmp_path, "online", flat(config)), killed)
+        trainer = Trainer(config, base)
+        trainer.train(Run(tmp_path, "online", flat(config)))
     assert [row["step"] for row in trainer.rows] == [40, 80, 120] and trainer.agent.updates >= 7
-    assert all(row["train_length"] == 30 for row in trainer.rows)
+    assert all(row["train_length"] == 9 for row in trainer.rows)
+
+
+SEEDS = np.array([3, 8, 5, 6])  # of episodes with different objects
+
+
+@pytest.fixture
+def several():
+    """Makes a task's batch of four lanes on an emulated GPU, and a fast step for each."""
+    made = []
+
+    def make(task):
+        spec = get_task(task)
+        made.extend([ManiSkillBatch(spec, 4), *(spec.make() for _ in range(4))])
+        return made[-5], made[-4:]
+
+    with emulated_gpu():
+        yield make
+        for sim in made:
+            sim.close()
+
+
+@pytest.mark.parametrize("task", ["StackCube", "PegInsertionSide", "TurnFaucet", "TurnFaucetSource", "PushChair", "PushChairSource"])
+def test_several_lanes_start_and_move_as_the_fast_step(several, task):
+    """Each with its own objects, of which some have more joints than others; and so do lanes that begin again while others go on."""
+    lanes, fast = several(task)
+    rng = np.random.default_rng(0)
+
+    def compare(observations, expected):
+        np.testing.assert_allclose(observations[:, :9], expected[:, :9], atol=5e-3)  # the arm control of a GPU, and of a CPU
+        rest = np.ones(observations.shape[1], bool)
+        rest[82:107] = not task.startswith("PushChair")  # how castors turn in place depends on the last digits
+        np.testing.assert_allclose(observations[:, rest], expected[:, rest], atol=0.05)
+
+    np.testing.assert_allclose(lanes.reset(np.arange(4), SEEDS), [sim.reset(int(seed)) for sim, seed in zip(fast, SEEDS, strict=True)],
+                               atol=1e-6)
+    if task.startswith("PushChair"):
+        assert len({built.max_dof for built in lanes._env.built}) > 1
+    for begin in ((), (1, 3), (0,)):
+        if begin:
+            again = lanes.reset(np.array(begin), SEEDS[list(begin)])
+            np.testing.assert_allclose(again, [fast[lane].reset(int(SEEDS[lane])) for lane in begin], atol=1e-6)
+        for _ in range(4):
+            actions = rng.uniform(-0.1, 0.1, (4, lanes._env.single_action_space.shape[0])).astype(np.float32)
+            observations, solved = lanes.step(actions)
+            results = [sim.step(action) for sim, action in zip(fast, actions, strict=True)]
+            compare(observations, np.stack([seen for seen, _ in results]))
+            assert solved.tolist() == [success for _, success in results]
+
+
+def test_a_lane_keeps_its_faucet_where_the_next_episode_has_another(several):
+    lanes, (fast, *_) = several("TurnFaucet")
+    other = next(seed for seed in range(40) if faucet_start(seed, fast.models).model != faucet_start(8, fast.models).model)
+    first = lanes.reset(np.arange(4), SEEDS)
+    moved, expected = lanes.reset(np.array([1]), np.array([other]))[0], fast.reset(other)
+    np.testing.assert_allclose(moved[:32], expected[:32], atol=1e-6)  # the arm
+    assert moved[32] == first[1, 32] != expected[32]  # how far its handle turns
+    assert 0.005 < np.abs(moved[36:39] - first[1, 36:39]).max() < 0.15  # where it stands
+
+
+def test_a_lane_keeps_its_chair_where_the_next_episode_has_another(several):
+    lanes, (fast, *_) = several("PushChair")
+    other = next(seed for seed in range(40) if chair_start(seed, 3).chair != chair_start(8, 3).chair)
+    lanes.reset(np.arange(4), SEEDS)
+    moved, expected = lanes.reset(np.array([1]), np.array([other]))[0], fast.reset(other)
+    np.testing.assert_allclose(moved[:57], expected[:57], atol=1e-6)  # the robot, and the chair's root link
+    assert lanes._env.built[1].max_dof != len(fast._chair._rest)
+
+
+def test_success_of_one_lane_is_that_lanes(several):
+    """A handle turned to just short of, and just past, nine tenths of its range; a chair that stands at the origin."""
+    lanes, _ = several("TurnFaucet")
+    lanes.reset(np.arange(4), SEEDS)
+    env = lanes._env
+    joints, handle = env.first_angles(), env.target_switch_link.joint
+    limits = handle.get_limits()[:, 1]
+    joints[torch.arange(4), handle.active_index] = limits * torch.tensor([0.0, 0.8999, 0.9001, 0.5])
+    env.faucet.set_qpos(joints)
+    fetched(env)
+    verdict = env.evaluate()
+    assert verdict["success"].tolist() == [False, False, True, False]
+    seen = env.get_obs(verdict)
+    np.testing.assert_allclose(seen[:, -1], limits * torch.tensor([0.9, 0.0001, -0.0001, 0.4]), atol=1e-5)
+    lanes.reset(np.array([0]), SEEDS[:1])
+    np.testing.assert_array_equal(env.get_obs(env.evaluate())[:, 25:32], seen[:, 25:32])  # where handles were at the start
+
+    lanes, _ = several("PushChair")
+    lanes.reset(np.arange(4), SEEDS)
+    env = lanes._env
+    poses = env.chair.pose.raw_pose.clone()
+    poses[[0, 2], :2] = torch.tensor([[0.1, 0.1], [0.1, 0.12]])  # 0.141 and 0.156 m from the origin
+    env.chair.set_pose(Pose.create(poses))
+    fetched(env)
+    assert env.evaluate()["success"].tolist() == [False] * 4  # it moved there just now
+    assert env.evaluate()["success"].tolist() == [True, False, False, False]
+
+
+def fetched(env):
+    """What was set, simulated and seen."""
+    env.scene._gpu_apply_all()
+    env.scene.px.gpu_update_articulation_kinematics()
+    env.scene._gpu_fetch_all()
+
+
+def test_lanes_have_the_friction_and_damping_of_the_episode_that_they_were_built_for(several):
+    lanes, _ = several("PushChair")
+    lanes.reset(np.arange(4), SEEDS)
+    for built, seed in zip(lanes._env.built, SEEDS, strict=True):
+        start, joints = chair_start(int(seed), 3), built._objs[0].active_joints
+        values = np.array([[joint.friction, joint.damping] for joint in joints])
+        swivel = ["helper" in joint.parent_link.name for joint in joints]
+        np.testing.assert_allclose(values[swivel], [start.swivel], rtol=1e-5)
+        np.testing.assert_allclose(values[:2], start.frictions[:2], rtol=1e-5)
+    lanes, _ = several("TurnFaucet")
+    lanes.reset(np.arange(4), SEEDS)
+    assert lanes._env.target_switch_link.joint.friction.numpy() == pytest.approx(0.1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("task", ["TurnFaucet", "PushChair"])
+def test_a_policy_solves_as_much_on_several_lanes(task):
+    """Of 18 episodes of the shipped decorated policy, at most 3 more or less."""
+    policy, spec = load_decorated(DATA / "checkpoints" / task / "decorated"), get_task(task)
+    solved = []
+    for simulator in ("cpu", "emulated GPU"):
+        policy.reset(0)
+        queue, episodes = list(selection_seeds(18)), []
+        with emulated_gpu(), VectorEnv(spec, 6, lambda lane, queue=queue: queue.pop(0) if queue else IDLE, terminate_on_success=True,
+                                       window=policy.window, chunk=policy.chunk, simulator=simulator) as env:
+            windows = env.reset()
+            while len(episodes) < 18:
+                result = env.step(policy.act(windows))
+                windows = result.windows
+                episodes += result.episodes
+        solved.append(sum(episode.success_once for episode in episodes))
+    assert min(solved) >= 9 and abs(solved[0] - solved[1]) <= 3
 
 
 def test_what_cannot_be_simulated_together_is_refused_with_what_to_do(monkeypatch):
     base = POLICIES["mlp"](dict(obs_dim=39, act_dim=28, hidden=8))
-    for spec in (get_task("Door"), get_task("TurnFaucet"), horizon_spec(get_task("StackCube"), 0.5)):
-        with pytest.raises(PdkitError, match="^physx_cuda simulates StackCube and PegInsertionSide.*set simulator=cpu"):
+    for spec in (get_task("Door"), horizon_spec(get_task("StackCube"), 0.5)):
+        with pytest.raises(PdkitError, match="^physx_cuda simulates StackCube, PegInsertionSide, .*PushChair.*set simulator=cpu"):
             VectorEnv(spec, 2, counting_seeds(), simulator="physx_cuda")  # from the process that simulates
     with pytest.raises(PdkitError, match="^physx_cuda simulates"):
         Trainer(OnlineConfig(task="Door", simulator="physx_cuda"), base)  # before anything is made

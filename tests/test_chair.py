@@ -15,7 +15,7 @@ from pdkit.demos.experts import scripted_episodes
 from pdkit.errors import PdkitError
 from pdkit.evaluate import evaluate
 from pdkit.tasks import chair_assets, get_task, lanes
-from pdkit.tasks.chair import PushChair, StockPushChairSource, make_chair_env
+from pdkit.tasks.chair import PushChair, PushChairSource, StockPushChairSource, make_chair_env
 from pdkit.tasks.chair_assets import Chair, chairs, generated_chair
 from pdkit.tasks.chair_body import chair_start, solved
 from pdkit.tasks.partnet import UrdfWriter, link_parts
@@ -30,7 +30,7 @@ CHAIR_QPOS, CHAIR_QVEL, TIPS, FINGERS = slice(57, 82), slice(82, 107), slice(107
 
 @pytest.fixture(scope="module")
 def fast():
-    sim = PushChair("source")
+    sim = PushChairSource()
     yield sim
     sim.close()
 
@@ -132,7 +132,7 @@ def test_chairs_velocities_are_its_motion(fast):
     fastest = np.argsort(np.linalg.norm(moved, axis=1))[-40:]
     mean = (observations[fastest, 51:53] + observations[fastest + 1, 51:53]) / 2
     assert np.corrcoef(moved[fastest].ravel(), mean.ravel())[0, 1] > 0.9
-    count = len(fast._env.chair.active_joints)
+    count = len(fast._env.built[0].active_joints)
     assert observations[:, 82 : 82 + count].any(axis=0).all() and not observations[:, 82 + count : 107].any()
 
 
@@ -152,7 +152,7 @@ def test_fast_step_is_the_stock_environments(fast, stock, seed):
 
 def test_same_seed_and_actions_repeat_whatever_came_before(fast):
     episodes = {seed: pushing(fast, seed, steps=40 + 20 * (seed % 4)) for seed in range(8)}
-    alone = {seed: play(PushChair("source"), seed, actions)[0] for seed, actions in episodes.items()}
+    alone = {seed: play(PushChairSource(), seed, actions)[0] for seed, actions in episodes.items()}
     rng = np.random.default_rng(0)
     for seed in rng.integers(8, size=14):
         stop = rng.integers(1, len(episodes[seed]) + 1)
@@ -163,7 +163,7 @@ def test_a_later_evaluation_builds_no_scene_and_gives_the_same(monkeypatch):
     """In what the first left behind, with other pushes in between."""
     spec, built, moved = get_task("PushChairSource"), [], []
     monkeypatch.setattr("pdkit.tasks.chair.make_chair_env", lambda *words: built.append(words) or make_chair_env(*words))
-    actions = pushing(PushChair("source"), 1, steps=60)
+    actions = pushing(PushChairSource(), 1, steps=60)
 
     def pushed(order):
         step = iter(actions[order])
@@ -186,14 +186,14 @@ def test_a_later_evaluation_builds_no_scene_and_gives_the_same(monkeypatch):
 
 
 def test_simulations_in_one_process_do_not_disturb_each_other():
-    kinds = ("source", "source", "novel")
-    sims, actions = [PushChair(kind) for kind in kinds], np.random.default_rng(0).uniform(-1, 1, (25, 20))
+    kinds = (PushChairSource, PushChairSource, PushChair)
+    sims, actions = [kind() for kind in kinds], np.random.default_rng(0).uniform(-1, 1, (25, 20))
     together = [[sim.reset(seed)] for seed, sim in enumerate(sims)]
     for action in actions:
         for sim, history in zip(sims, together, strict=True):
             history.append(sim.step(action)[0])
     for seed, (kind, history) in enumerate(zip(kinds, together, strict=True)):
-        np.testing.assert_array_equal(np.stack(history), play(PushChair(kind), seed, actions)[0])
+        np.testing.assert_array_equal(np.stack(history), play(kind(), seed, actions)[0])
 
 
 def test_other_tasks_do_not_disturb(fast):
@@ -261,11 +261,11 @@ def test_source_and_novel_chairs_are_disjoint_and_all_differ():
         chairs("novell")
 
 
-@pytest.mark.parametrize("kind", ["source", "novel"])
+@pytest.mark.parametrize("kind", [PushChairSource, PushChair])
 def test_every_chair_stands_by_itself_on_its_wheels(kind):
-    sim, seen, seed = PushChair(kind), set(), 0
-    while len(seen) < len(chairs(kind)):
-        chair, seed = chair_start(seed, len(chairs(kind))).chair, seed + 1
+    sim, count, seen, seed = kind(), len(chairs(kind.kind)), set(), 0
+    while len(seen) < count:
+        chair, seed = chair_start(seed, count).chair, seed + 1
         if chair in seen:
             continue
         seen.add(chair)
@@ -276,7 +276,7 @@ def test_every_chair_stands_by_itself_on_its_wheels(kind):
 
 def test_wheels_grip_and_seats_do_not_touch_their_feet(fast):
     fast.reset(0)
-    links = {name: link._objs[0] for name, link in fast._env.chair.links_map.items()}
+    links = {name: link._objs[0] for name, link in fast._env.built[0].links_map.items()}
     for name, link in links.items():
         for shape in link.collision_shapes:
             assert shape.physical_material.dynamic_friction == pytest.approx(1.0 if name.startswith("wheel") else 0.1)
@@ -307,7 +307,7 @@ def wrapped(angle: float) -> float:
 def test_the_seat_faces_where_the_start_says(fast):
     for seed in range(5):
         fast.reset(seed)
-        seat = fast._env.chair.links_map["seat"]._objs[0].entity_pose.to_transformation_matrix()
+        seat = fast._env.built[0].links_map["seat"]._objs[0].entity_pose.to_transformation_matrix()
         facing = chair_start(seed, 5).facing
         np.testing.assert_allclose(-seat[:2, 1], [np.cos(facing), np.sin(facing)], atol=1e-5)
 
@@ -331,7 +331,7 @@ def test_frictions_are_drawn_for_every_episode_and_repeat(fast):
 def test_plans_show_chair_robot_and_target(fast):
     with pytest.raises(PdkitError, match="render=True"):
         fast.render()
-    sim = PushChair("source", render=True)
+    sim = PushChairSource(render=True)
     observation = sim.reset(0)
     picture = sim.render()
     assert picture.shape == (256, 256, 3) and picture.dtype == np.uint8
@@ -374,12 +374,12 @@ def test_partnet_chairs_take_the_place_of_generated_ones(partnet):
     assert [chair.model.path for chair in chairs("novel")] == [folder / name / "mobility.urdf" for name in ("3003", "3013", "3020")]
     (folder / "3013" / "mobility_cvx.urdf").write_text((folder / "3013" / "mobility.urdf").read_text())
     assert chairs("novel")[1].model.path.name == "mobility_cvx.urdf"  # ManiSkill 2's corrected file is preferred
-    sim = PushChair("novel")
+    sim = PushChair()
     for seed in range(3):
         observation, start = sim.reset(seed), chair_start(seed, 3)
         np.testing.assert_allclose(observation[PLACE], [*start.place, 0.004], atol=1e-6)
         assert observation[57] == np.float32(0.1)
-        seat = sim._env.chair.links_map["seat"]._objs[0].entity_pose.to_transformation_matrix()
+        seat = sim._env.built[0].links_map["seat"]._objs[0].entity_pose.to_transformation_matrix()
         faces = np.arctan2(seat[1, 0], seat[0, 0]) - np.pi / 2
         assert wrapped(faces - start.facing) == pytest.approx(0, abs=1e-5)
 
@@ -403,7 +403,7 @@ def test_partnet_meshes_take_part(partnet):
     seats = []
     for chair in (mesh, Chair(generated_chair(25))):
         env = make_chair_env([chair])
-        seats.append(env.chair.links_map["seat"]._objs[0])
+        seats.append(env.built[0].links_map["seat"]._objs[0])
         assert len(seats[-1].collision_shapes) == boxes.count('<collision name="seat-')
     assert seats[0].mass == pytest.approx(seats[1].mass, rel=1e-3) and seats[0].mass > 1
     np.testing.assert_allclose(seats[0].compute_global_aabb_tight()[1][2], seats[1].compute_global_aabb_tight()[1][2] + 0.002, atol=1e-3)

@@ -152,7 +152,7 @@ def in_its_own_process(function, *arguments):
             pytest.skip(str(error))
 
 
-@pytest.mark.parametrize("task", ["StackCube", "PegInsertionSide"])
+@pytest.mark.parametrize("task", ["StackCube", "PegInsertionSide", "TurnFaucet", "PushChair"])
 def test_lanes_simulated_together_start_and_move_as_on_the_cpu(task):
     spec, fast, seeds = get_task(task), get_task(task).make(), np.array([3, 4, 5, 6])
     # Small actions: the arm control of a GPU falls short of large ones.

@@ -49,7 +49,7 @@ def test_the_object_of_an_episode_is_the_simulators(task):
         seeds = range(1_000_000, 1_000_008)
         for seed in seeds:
             sim.reset(seed)
-            there = sim.models[sim._model] if task == "TurnFaucet" else sim._env._chair
+            there = sim.models[sim._model] if task == "TurnFaucet" else sim._env.chairs[0]
             assert there.model.name == models[analysis.object_of(spec.name, seed)].name
         sim.close()
     names = [{model.name for model in analysis.objects(spec.name)} for spec in (source, novel)]

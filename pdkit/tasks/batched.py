@@ -7,29 +7,40 @@ Here it is stock ManiSkill that steps, not the fast step of maniskill.py. What d
 - Physics on a GPU does not repeat bit for bit, so neither does a training run, and a restored checkpoint puts lanes only nearly
   where they were.
 - Only training is simulated so. Every evaluation is made by the fast step on the CPU, in the world in which all policies of this
-  kit are compared. StackCube's shipped decorated policy solves about as much with either arm control (a slow test compares).
-- An episode starts where the fast step starts it for the same seed, but bodies cannot be built while the GPU simulates: a lane of
-  PegInsertionSide keeps the peg and the box of its first episode, and only where they lie changes.
+  kit are compared. StackCube's, TurnFaucet's and PushChair's shipped decorated policies solve about as much either way (slow tests).
+- An episode starts where the fast step starts it for the same seed, but bodies cannot be built while the GPU simulates: a lane keeps
+  the peg and the box, the faucet and the handle that is to be turned, or the chair and its joints' friction, of its first episode, and
+  only where they are changes.
 - PhysX for CUDA changes how its process simulates on the CPU as well, so the lanes have a process of their own (see VectorEnv).
 """
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 from zipfile import BadZipFile
 
 import numpy as np
 
 from ..errors import PdkitError
+from .chair import PushChair, PushChairSource, standing
+from .chair_body import chair_start
+from .faucet import TurnFaucet, TurnFaucetSource
 from .lanes import IDLE, EpisodeCount
-from .maniskill import building, with_base_pose
-from .maniskill_headless import make_env, quiet
+from .maniskill import FastSim, building, with_base_pose
+from .maniskill_headless import quiet
+from .mobile_panda import first_joints
 from .peg import PegInsertionSide, peg_start
 from .spec import TaskSpec
 from .stack_cube import StackCube, stack_cube_start
 
-Start = tuple[np.ndarray, dict[str, np.ndarray]]  # joint positions (9,), and poses (7,) of bodies by ManiSkill's names
+
+class Start(NamedTuple):
+    """Where an episode starts; poses (7,) by ManiSkill's names of what is there."""
+
+    joints: np.ndarray  # of the robot, in PhysX's order
+    bodies: dict[str, np.ndarray] = {}
+    articulated: dict[str, tuple[np.ndarray, np.ndarray]] = {}  # of the root link, and joint positions
 
 
 class BatchSim(Protocol):
@@ -44,34 +55,50 @@ class BatchSim(Protocol):
     def close(self) -> None: ...
 
 
-def _stack_cube(seed: int, built: int) -> Start:
+def _stack_cube(env: Any, lane: int, seed: int, built: int) -> Start:
     joints, red, green = stack_cube_start(seed)
-    return joints, {"cubeA": red, "cubeB": green}
+    return Start(joints, {"cubeA": red, "cubeB": green})
 
 
-def _peg(seed: int, built: int) -> Start:
+def _peg(env: Any, lane: int, seed: int, built: int) -> Start:
     start, bodies = peg_start(seed), peg_start(built)
     peg, box = start.peg.copy(), start.box.copy()
     peg[2], box[2] = bodies.radius, bodies.half_length  # both lie on the table
-    return start.joints, {"peg": peg, "box_with_hole": box}
+    return Start(start.joints, {"peg": peg, "box_with_hole": box})
+
+
+def _faucet(env: Any, lane: int, seed: int, built: int) -> Start:
+    from .faucet_env import faucet_start
+
+    start = faucet_start(seed, env.models)
+    pose = start.pose(env.models[env.starts[lane].model])
+    return Start(start.joints, articulated={"faucet": (np.concatenate([pose.p, pose.q]), env.first_angles()[lane].cpu().numpy())})
+
+
+def _chair(env: Any, lane: int, seed: int, built: int) -> Start:
+    start, chair = chair_start(seed, len(env.chairs)), env.chairs[env.starts[lane].chair]
+    pose, joints = standing(chair).start(start)
+    return Start(first_joints(start.base, env.order), articulated={"chair": (np.concatenate([pose.p, pose.q]), joints)})
 
 
 # Where the episode of a seed starts in a lane that was built for another seed.
-STARTS: dict[Callable[..., Any], Callable[[int, int], Start]] = {StackCube: _stack_cube, PegInsertionSide: _peg}
+STARTS: dict[Callable[..., Any], Callable[[Any, int, int, int], Start]] = {
+    StackCube: _stack_cube, PegInsertionSide: _peg, TurnFaucet: _faucet, TurnFaucetSource: _faucet, PushChair: _chair,
+    PushChairSource: _chair}
 
 
 class ManiSkillBatch:
     """A task through ManiSkill's own step, all lanes in one scene; a `BatchSim`.
 
     Args:
-        spec: StackCube or PegInsertionSide as they are in the registry.
+        spec: a task of ManiSkill as it is in the registry.
         num_envs: N.
         backend: ManiSkill's name of what simulates. "physx_cpu" takes one lane: so the tests compare it with the fast step.
     """
 
     def __init__(self, spec: TaskSpec, num_envs: int, backend: str = "physx_cuda"):
-        self._start = STARTS[spec.make]
-        self._env = make_env(spec.make.env_id, spec.make.control, sim_backend=backend, num_envs=num_envs, reconfiguration_freq=0)
+        self._start, self._base_pose = STARTS[spec.make], issubclass(spec.make, FastSim)
+        self._env = spec.make.build(render=False, sim_backend=backend, num_envs=num_envs, reconfiguration_freq=0)
         self._built: list[int] = []  # the seed that each lane was built for
 
     def reset(self, lanes: np.ndarray, seeds: np.ndarray) -> np.ndarray:
@@ -83,24 +110,36 @@ class ManiSkillBatch:
             with building(False):
                 self._env.reset(seed=self._built, options={"reconfigure": True})
         # Starts are given as states, because ManiSkill draws those of all lanes from the first one's seed.
-        starts = [self._start(int(seed), self._built[lane]) for lane, seed in zip(lanes, seeds, strict=True)]
-        robot, still = self._env.agent.robot, np.zeros((len(starts), 6))
-        joints = np.stack([joints for joints, _ in starts])
-        states = {
-            "actors": {name: self._tensor([bodies[name] for _, bodies in starts], still) for name in starts[0][1]},
-            "articulations": {robot.name: self._tensor(robot.pose.raw_pose.cpu().numpy()[lanes], still, joints, 0 * joints)},
-        }
+        starts = [self._start(self._env, lane, int(seed), self._built[lane]) for lane, seed in zip(lanes, seeds, strict=True)]
+        robot = self._env.agent.robot
+        poses = robot.pose.raw_pose.cpu().numpy()[lanes]
+        articulated = {robot.name: [(pose, start.joints) for pose, start in zip(poses, starts, strict=True)]}
+        articulated |= {name: [start.articulated[name] for start in starts] for name in starts[0].articulated}
+        states = dict(
+            actors={name: self._states([(start.bodies[name], ()) for start in starts], 0) for name in starts[0].bodies},
+            articulations={name: self._states(placed, self._env.scene.state_dict_registry.articulations[name].max_dof)
+                           for name, placed in articulated.items()})
         options = {"env_idx": torch.as_tensor(lanes, device=self._env.device), "reset_to_env_states": {"env_states": states}}
-        return with_base_pose(self._env, self._env.reset(options=options)[0])[lanes]
+        return self._seen(self._env.reset(options=options)[0])[lanes]
 
-    def _tensor(self, *columns: Any) -> Any:
+    def _states(self, placed: list[tuple[np.ndarray, Any]], dof: int) -> Any:
+        """ManiSkill's states (k, 13 + 2 dof) of bodies at rest at poses (7,), with joint positions that are padded to `dof`."""
+        states = np.zeros((len(placed), 13 + 2 * dof), np.float32)
+        for state, (pose, joints) in zip(states, placed, strict=True):
+            state[:7], state[13 : 13 + len(joints)] = pose, joints
+        return self._tensor(states)
+
+    def _tensor(self, values: np.ndarray) -> Any:
         import torch
 
-        return torch.from_numpy(np.hstack(columns).astype(np.float32)).to(self._env.device)
+        return torch.from_numpy(np.asarray(values, np.float32)).to(self._env.device)
+
+    def _seen(self, observations: Any) -> np.ndarray:
+        return with_base_pose(self._env, observations) if self._base_pose else observations.cpu().numpy()
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         observations, _, _, _, info = self._env.step(self._tensor(actions))
-        return with_base_pose(self._env, observations), info["success"].cpu().numpy()
+        return self._seen(observations), info["success"].cpu().numpy()
 
     def close(self) -> None:
         self._env.close()
@@ -111,7 +150,7 @@ def require_batched(spec: TaskSpec) -> None:
     import torch
 
     if spec.make not in STARTS:
-        raise PdkitError(f"physx_cuda simulates {' and '.join(task.__name__ for task in STARTS)}, whole episodes with states as "
+        raise PdkitError(f"physx_cuda simulates {', '.join(task.__name__ for task in STARTS)}, whole episodes with states as "
                          f"observations, and not {spec.name} as it is set up here; set simulator=cpu.")
     if not torch.cuda.is_available():
         raise PdkitError("physx_cuda needs a CUDA device, and none was found; set simulator=cpu, or check the driver with `pdkit doctor`.")

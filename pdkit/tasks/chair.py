@@ -10,14 +10,14 @@ the base's x, y and heading and their velocities (6); of the chair's root link t
 """
 from __future__ import annotations
 
-from functools import partial
-from typing import Any
+from functools import cache
+from typing import Any, ClassVar
 
 import numpy as np
 
 from ..errors import PdkitError
 from .chair_assets import Chair, chairs
-from .chair_body import HZ, chair_start, solved
+from .chair_body import HZ, ChairBody, chair_start, solved
 from .chair_plan import plan
 from .maniskill import renew_physics
 from .maniskill_headless import Camera, close_env, make_env, quiet
@@ -27,25 +27,41 @@ from .spec import TaskSpec
 CAMERA: Camera = ((2.0, -2.0, 2.2), (0.0, 0.0, 0.5))  # ManiSkill's own; visual policies bring theirs
 
 
-def make_chair_env(selection: list[Chair], cameras: bool = False) -> Any:
-    """The stock ManiSkill environment in which every episode has one of the chairs; with `cameras` in a scene that can be drawn."""
+def make_chair_env(selection: list[Chair], cameras: bool = False, **options: Any) -> Any:
+    """The stock ManiSkill environment in which every episode has one of the chairs; with `cameras` in a scene that can be drawn.
+    `options` are ManiSkill's."""
     with quiet():
         from . import chair_env  # registers it
-    return make_env(chair_env.NAME, CONTROL, CAMERA if cameras else None, chairs=selection)
+    return make_env(chair_env.NAME, CONTROL, CAMERA if cameras else None, chairs=selection, **options)
+
+
+@cache
+def standing(chair: Chair) -> ChairBody:
+    """A chair's body, to ask where it is put (`ChairBody.start`): its scene is gone."""
+    env = make_chair_env([chair])
+    body = env.body
+    close_env(env)
+    return body
 
 
 class PushChair:
-    """The fast step; see `Sim` for the methods. `kind` is "source" or "novel"; a chair's scene is built when first needed.
+    """The fast step, with the novel chairs; see `Sim` for the methods. A chair's scene is built when first needed.
 
     With `cameras` the scenes can be drawn by pdkit/pixels (`render` draws plans of the floor, without a scene).
     """
 
+    kind: ClassVar[str] = "novel"
     slow_to_build = True  # a scene takes as long as some tens of steps: lanes keep it when they are closed
 
-    def __init__(self, kind: str, render: bool = False, cameras: bool = False):
+    def __init__(self, render: bool = False, cameras: bool = False):
         self._can_render, self._cameras = render, cameras
-        self._chairs = chairs(kind)
+        self._chairs = chairs(self.kind)
         self._scenes: dict[int, tuple[Any, MobilePanda]] = {}
+
+    @classmethod
+    def build(cls, render: bool, **options: Any) -> Any:
+        """The stock environment behind this task; `options` are ManiSkill's."""
+        return make_chair_env(chairs(cls.kind), render, **options)
 
     def reset(self, seed: int) -> np.ndarray:
         start = chair_start(seed, len(self._chairs))
@@ -81,11 +97,17 @@ class PushChair:
             close_env(env)
 
 
+class PushChairSource(PushChair):
+    """The same task with the source chairs."""
+
+    kind = "source"
+
+
 class StockPushChairSource:
     """PushChairSource through ManiSkill's own step, to test and time the fast step against. A chair is built anew in each episode."""
 
     def __init__(self):
-        self._env = make_chair_env(chairs("source"))
+        self._env = PushChairSource.build(render=False)
 
     def reset(self, seed: int) -> np.ndarray:
         return self._env.reset(seed=seed)[0][0].numpy()
@@ -115,8 +137,8 @@ _COMMON = dict(
     held_actions=(11, 19),
 )
 CHAIR_TASKS = (
-    TaskSpec(name="PushChair", make=partial(PushChair, "novel"), demo_task="PushChairSource", **_COMMON,
+    TaskSpec(name="PushChair", make=PushChair, demo_task="PushChairSource", **_COMMON,
              summary="A robot with two arms must push a swivel chair that its demonstrations never showed to the middle of the room."),
-    TaskSpec(name="PushChairSource", make=partial(PushChair, "source"), **_COMMON,
+    TaskSpec(name="PushChairSource", make=PushChairSource, **_COMMON,
              summary="PushChair with the chairs of the demonstrations."),
 )

@@ -1,6 +1,7 @@
 """A chair within a SAPIEN scene: how an episode begins, where the chair is put, what is seen of it, and when it counts as pushed home."""
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -73,13 +74,18 @@ class ChairBody:
         forward = seat.entity_pose.to_transformation_matrix()
         self._facing = np.arctan2(forward[1, 0], forward[0, 0]) - np.pi / 2
 
-    def place(self, start: Start) -> None:
-        """Put the chair, at rest, where an episode begins, with that episode's frictions."""
+    def start(self, start: Start) -> tuple[Any, np.ndarray]:
+        """Where an episode begins: the root link's pose, SAPIEN's, and the joints' positions (n,), radians."""
         half = (start.facing - self._facing) / 2
         turned = self._pose([*start.place, self._height], [np.cos(half), 0, 0, np.sin(half)])
+        return turned * self._rest_turn, self._rest
+
+    def place(self, start: Start) -> None:
+        """Put the chair, at rest, where an episode begins, with that episode's frictions."""
         body, none = self._articulation, np.zeros(3, np.float32)
-        body.set_root_pose(turned * self._rest_turn)
-        body.set_qpos(self._rest)
+        pose, joints = self.start(start)
+        body.set_root_pose(pose)
+        body.set_qpos(joints)
         body.set_root_linear_velocity(none)
         body.set_root_angular_velocity(none)
         still = np.zeros(len(self._rest), np.float32)
@@ -87,10 +93,7 @@ class ChairBody:
         body.set_qf(still)
         body.root.put_to_sleep()  # as maniskill.place_body does, and for the same reason
         body.root.wake_up()
-        for joint, castor in zip(self._joints, start.frictions, strict=False):
-            friction, damping = start.swivel if "helper" in joint.parent_link.name else castor
-            joint.set_friction(friction)
-            joint.set_drive_properties(0, damping)
+        set_frictions(self._joints, start)
 
     @property
     def root(self) -> tuple[np.ndarray, np.ndarray]:
@@ -106,6 +109,14 @@ class ChairBody:
         state[7:10], state[10:13] = root.linear_velocity, root.angular_velocity
         state[13 : 13 + count], state[13 + ROOM : 13 + ROOM + count] = body.qpos, body.qvel
         return state
+
+
+def set_frictions(joints: Sequence[Any], start: Start) -> None:
+    """Give a chair's active joints, SAPIEN's, the friction and damping of an episode."""
+    for joint, castor in zip(joints, start.frictions, strict=False):
+        friction, damping = start.swivel if "helper" in joint.parent_link.name else castor
+        joint.set_friction(friction)
+        joint.set_drive_properties(0, damping)
 
 
 def solved(before: tuple[np.ndarray, np.ndarray], now: tuple[np.ndarray, np.ndarray]) -> bool:

@@ -23,13 +23,14 @@ from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.utils.building.ground import build_ground
 from mani_skill.utils.geometry.rotation_conversions import quaternion_to_axis_angle
 from mani_skill.utils.registration import register_env
+from mani_skill.utils.structs import Articulation, Pose
 from mani_skill.utils.structs.types import DefaultMaterialsConfig, SceneConfig, SimConfig
 
 from ..errors import PdkitError
 from .chair_assets import SCALE, Chair
-from .chair_body import CLOSE, HZ, STILL, UPRIGHT, ChairBody, chair_start
+from .chair_body import CLOSE, HZ, ROOM, STILL, UPRIGHT, ChairBody, chair_start, set_frictions
 from .maniskill import building
-from .mobile_panda import ACTING, ARM_REST, BASE_JOINTS, CONTROL, FINGERS, JOINTS, SIDES, TIPS, arm_joints, finger_joints, joint_order
+from .mobile_panda import ACTING, BASE_JOINTS, CONTROL, FINGERS, SIDES, TIP_JOINTS, arm_joints, finger_joints, first_joints, joint_order
 from .partnet import link_parts
 
 NAME = "PdkitPushChair-v1"
@@ -78,19 +79,25 @@ def _drawn_description() -> Iterator[None]:
 
 @register_env(NAME, max_episode_steps=200)
 class PushChairEnv(BaseEnv):
-    """Push the chair to the origin. A reset builds the scene anew, with the chair that the seed picks out of `chairs`."""
+    """Push the chair to the origin. Each lane has the one out of `chairs`, with those frictions, which the seed says that its scene was
+    built for.
+
+    On a CPU there is one lane, and its scene is built anew for every episode. On a GPU episodes start where `reset` is told that they do,
+    by states (batched.py).
+    """
 
     SUPPORTED_ROBOTS = [MobilePandaDualArm.uid]
     SUPPORTED_REWARD_MODES = ("sparse", "none")
 
-    def __init__(self, *args: Any, chairs: Sequence[Chair], **kwargs: Any):
-        self._chairs, self._drawn = chairs, kwargs.get("render_backend") != "none"
-        super().__init__(*args, robot_uids=MobilePandaDualArm.uid, reconfiguration_freq=1, **kwargs)
+    def __init__(self, *args: Any, chairs: Sequence[Chair], reconfiguration_freq: int = 1, **kwargs: Any):
+        self.chairs, self._drawn = chairs, kwargs.get("render_backend") != "none"
+        super().__init__(*args, robot_uids=MobilePandaDualArm.uid, reconfiguration_freq=reconfiguration_freq, **kwargs)
 
     @property
     def _default_sim_config(self) -> SimConfig:
         return SimConfig(
-            sim_freq=100, control_freq=HZ, scene_config=SceneConfig(solver_position_iterations=15),
+            sim_freq=100, control_freq=HZ, spacing=20,  # metres between lanes on a GPU: at most 10 seconds at 0.7 m/s, from 2.4 m
+            scene_config=SceneConfig(solver_position_iterations=15),
             default_materials_config=DefaultMaterialsConfig(static_friction=0.5, dynamic_friction=0.5, restitution=0))
 
     def _reconfigure(self, options: dict) -> None:
@@ -101,28 +108,40 @@ class PushChairEnv(BaseEnv):
         with _drawn_description() if self._drawn else nullcontext():
             super()._load_agent(options, sapien.Pose())
         self.agent.robot.links_map["adjustable_body"].set_collision_group_bit(2, TORSO, 1)
-        self._order = joint_order(self.agent.robot)
+        self.order = joint_order(self.agent.robot)
 
     def _load_scene(self, options: dict) -> None:
         build_ground(self.scene).set_collision_group_bit(2, TORSO, 1)  # the torso's box reaches into the floor
-        self._start = chair_start(int(self._episode_seed[0]), len(self._chairs))
-        self._chair = chair = self._chairs[self._start.chair]
+        self.starts = [chair_start(int(seed), len(self.chairs)) for seed in self._episode_seed]
+        self.built = [self._build(self.chairs[start.chair], lane) for lane, start in enumerate(self.starts)]
+        self.chair = Articulation.merge(self.built, name="chair")
+        self.add_to_state_dict_registry(self.chair)
+        for built, start in zip(self.built, self.starts, strict=True):
+            chair = self.chairs[start.chair]
+            seat = self._prepare_links(built, chair)
+            if self.gpu_sim_enabled:
+                set_frictions(built._objs[0].active_joints, start)
+            else:
+                self.body = ChairBody(built._objs[0], chair, seat)
+
+    def _build(self, chair: Chair, lane: int) -> Articulation:
         loader = self.scene.create_urdf_loader()
-        loader.name, loader.scale, loader.fix_root_link, loader.load_multiple_collisions_from_file = "chair", SCALE, False, True
+        loader.name, loader.scale, loader.fix_root_link, loader.load_multiple_collisions_from_file = f"chair-{lane}", SCALE, False, True
         loader.set_material(0.1, 0.1, 0)
         loader.set_density(200)
         with chair.model.file() as path:
             builder = loader.parse(path)["articulation_builders"][0]
         builder.initial_pose = sapien.Pose(chair.position, chair.rotation)
-        self.chair = builder.build(fix_root_link=False)
-        seat = self._prepare_links(link_parts(chair.model.urdf))
-        self.body = ChairBody(self.chair._objs[0], chair, seat)
+        builder.set_scene_idxs([lane])
+        built = builder.build(fix_root_link=False)
+        self.remove_from_state_dict_registry(built)
+        return built
 
-    def _prepare_links(self, parts: dict[str, str]) -> Any:
+    def _prepare_links(self, built: Articulation, chair: Chair) -> Any:
         """Wheels that grip and a seat that does not collide with its foot, as in ManiSkill 2; the seat's link, SAPIEN's."""
-        links = self.chair.links_map
+        links, parts = built.links_map, link_parts(chair.model.urdf)
         if not any("seat" in named for named in parts.values()):
-            raise PdkitError(f"Chair {self._chair.model.name} has no part called seat; put PartNet-Mobility's own description there.")
+            raise PdkitError(f"Chair {chair.model.name} has no part called seat; put PartNet-Mobility's own description there.")
         seats = [link for name, link in links.items() if "seat" in parts[name]]
         feet = [link for name, link in links.items() if "leg" in parts[name] or "foot" in parts[name]]
         if seats[0] not in feet:
@@ -136,10 +155,9 @@ class PushChairEnv(BaseEnv):
         return seats[0]._objs[0]
 
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
-        self.body.place(self._start)
-        positions = np.empty(len(JOINTS), np.float32)
-        positions[self._order] = [*self._start.base, *ARM_REST, *ARM_REST]
-        self.agent.reset(positions)
+        if not self.gpu_sim_enabled:
+            self.body.place(self.starts[0])
+            self.agent.reset(first_joints(self.starts[0].base, self.order))
         self._now = self.chair.pose
 
     def evaluate(self) -> dict[str, torch.Tensor]:
@@ -157,13 +175,28 @@ class PushChairEnv(BaseEnv):
         return verdicts | dict(success=torch.stack(list(verdicts.values())).all(dim=0))
 
     def _get_obs_agent(self) -> dict[str, torch.Tensor]:
-        qpos, qvel = self.agent.robot.qpos[:, self._order], self.agent.robot.qvel[:, self._order]
+        qpos, qvel = self.agent.robot.qpos[:, self.order], self.agent.robot.qvel[:, self.order]
         return dict(qpos=qpos[:, 3:], qvel=qvel[:, 3:], base=qpos[:, :3], base_velocity=qvel[:, :3])
 
     def _get_obs_extra(self, info: dict) -> dict[str, torch.Tensor]:
-        robot = self.agent.robot
-        tips = [(robot.joints_map[f"{side}_panda_{name}"]._objs[0].global_pose * sapien.Pose([0, along, 0])).p
-                for side in SIDES for name, along in TIPS]
-        fingers = [robot.links_map[name].linear_velocity for name in FINGERS]
+        fingers = torch.cat([self.agent.robot.links_map[name].linear_velocity for name in FINGERS], dim=1)
+        if self.gpu_sim_enabled:
+            return dict(chair=self._chair_state(), finger_places=self._tips(), finger_velocities=fingers)
+        # With SAPIEN's roundings, as the fast step has them.
+        joints = self.agent.robot.joints_map
+        tips = [(joints[name]._objs[0].global_pose * sapien.Pose([0, along, 0])).p for name, along in TIP_JOINTS]
         return dict(chair=torch.from_numpy(self.body.state())[None], finger_places=torch.tensor(np.concatenate(tips))[None],
-                    finger_velocities=torch.cat(fingers, dim=1))
+                    finger_velocities=fingers)
+
+    def _chair_state(self) -> torch.Tensor:
+        """As `ChairBody.state`, of all lanes: (N, 63)."""
+        root, joints = self.chair.root, (self.chair.qpos, self.chair.qvel)
+        padded = [torch.nn.functional.pad(values, (0, ROOM - values.shape[1])) for values in joints]
+        return torch.cat([root.pose.raw_pose, root.linear_velocity, root.angular_velocity, *padded], dim=1)
+
+    def _tips(self) -> torch.Tensor:
+        """Places of the finger tips of all lanes: (N, 12)."""
+        joints = self.agent.robot.joints_map
+        along = torch.tensor([[0, along, 0] for _, along in TIP_JOINTS], dtype=torch.float32, device=self.device)
+        return torch.cat([(joints[name].global_pose * Pose.create_from_pq(p=here)).p
+                          for (name, _), here in zip(TIP_JOINTS, along, strict=True)], dim=1)

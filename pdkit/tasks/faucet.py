@@ -34,16 +34,16 @@ class TurnFaucet(FastSim):
     def __init__(self, render: bool = False):
         super().__init__(render)
         self.models = faucets(self.novel)
-        self._model = self._env.start.model
-        self._built = {self._model: self._env.faucet}  # number of a faucet: ManiSkill's articulation
-        self._entities = {self._model: _entities(self._env.faucet)}  # SAPIEN forgets one that is in no scene and in no hand
+        self._model, faucet = self._env.starts[0].model, self._env.faucets[0]
+        self._built = {self._model: faucet}  # number of a faucet: ManiSkill's articulation
+        self._entities = {self._model: _entities(faucet)}  # SAPIEN forgets one that is in no scene and in no hand
 
     @classmethod
-    def build(cls, render: bool) -> Any:
+    def build(cls, render: bool, **options: Any) -> Any:
         models = faucets(cls.novel)
         with quiet():
             from .faucet_env import ENV_ID
-        return make_env(ENV_ID, cls.control, cls.camera if render else None, models=models)
+        return make_env(ENV_ID, cls.control, cls.camera if render else None, models=models, **options)
 
     def reset(self, seed: int) -> np.ndarray:
         from .faucet_env import faucet_start

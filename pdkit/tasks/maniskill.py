@@ -43,9 +43,9 @@ class FastSim:
         self._panda = Panda(self._env)
 
     @classmethod
-    def build(cls, render: bool) -> Any:
-        """The stock environment behind this task."""
-        return make_env(cls.env_id, cls.control, cls.camera if render else None)
+    def build(cls, render: bool, **options: Any) -> Any:
+        """The stock environment behind this task; `options` are ManiSkill's."""
+        return make_env(cls.env_id, cls.control, cls.camera if render else None, **options)
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, bool]:
         self._panda.drive(_clipped(action))

@@ -13,7 +13,8 @@ BASE_JOINTS = ("root_x_axis_joint", "root_y_axis_joint", "root_z_rotation_joint"
 SIDES = ("right", "left")  # in the order of observations
 ACTING = ("left", "right")  # in the order of actions (ManiSkill 2)
 ARM_REST = (0, 0, 0, -1.5, 0, 3, 0.78, 0.02, 0.02)  # seven joints and two fingers of an arm when an episode starts
-TIPS = (("finger_joint2", 0.035), ("finger_joint1", -0.035))  # a hand's finger tips: metres along y of these joints' frames
+# The finger tips: metres along y of these joints' frames.
+TIP_JOINTS = [(f"{side}_panda_{name}", along) for side in SIDES for name, along in (("finger_joint2", 0.035), ("finger_joint1", -0.035))]
 
 
 def arm_joints(side: str) -> list[str]:
@@ -32,6 +33,13 @@ def joint_order(robot: Any) -> list[int]:
     """Where each of JOINTS is among the robot's joints: PhysX goes through both arms at once."""
     names = [joint.name for joint in robot.active_joints]
     return [names.index(name) for name in JOINTS]
+
+
+def first_joints(base: np.ndarray, order: list[int]) -> np.ndarray:
+    """Joint positions (22,) where an episode begins, in PhysX's order: the base at (x, y, heading, height), the arms at rest."""
+    positions = np.empty(len(JOINTS), np.float32)
+    positions[order] = [*base, *ARM_REST, *ARM_REST]
+    return positions
 
 
 class MobilePanda:
@@ -53,7 +61,7 @@ class MobilePanda:
         self._base = [joints[name] for name in BASE_JOINTS]
         self._arms = [[joints[name] for name in arm_joints(side)] for side in ACTING]
         self._grippers = [[joints[name] for name in finger_joints(side)] for side in ACTING]
-        self._tips = [(joints[f"{side}_panda_{name}"], sapien.Pose([0, along, 0])) for side in SIDES for name, along in TIPS]
+        self._tips = [(joints[name], sapien.Pose([0, along, 0])) for name, along in TIP_JOINTS]
         self._fingers = [robot.links_map[name]._objs[0] for name in FINGERS]
         parts = env.agent.controller.controllers.values()
         low, high = (np.concatenate([getattr(part, f"action_space_{end}").numpy() for part in parts]) for end in ("low", "high"))
@@ -63,10 +71,8 @@ class MobilePanda:
 
     def place(self, base: np.ndarray) -> None:
         """Put the base at (x, y, heading, height), the arms at rest, everything still."""
-        positions = np.empty(len(JOINTS), np.float32)
-        positions[self._order] = [*base, *ARM_REST, *ARM_REST]
         still = np.zeros(len(JOINTS), np.float32)
-        self.robot.set_qpos(positions)
+        self.robot.set_qpos(first_joints(base, self._order))
         self.robot.set_qvel(still)
         self.robot.set_qf(still)
 
