@@ -1,8 +1,9 @@
 """ManiSkill's GPU simulation on a CPU: `with emulated_gpu():` makes `sim_backend="physx_cuda"` simulate each lane in a world of its own.
 
-Only PhysX for CUDA is replaced: its buffers for the poses of all bodies and the joints of all articulations, and the calls that copy
-between these and the simulation. So ManiSkill's own code for many lanes runs, with its reset masks, padded joints and arm control, and
-what it forgets to apply or to fetch is stale here, too. What PhysX itself does otherwise on a GPU stays for test_cuda.py.
+PhysX for CUDA is replaced: its buffers for the poses of all bodies and the joints of all articulations, and the calls that copy between
+these and the simulation; and where ManiSkill looks whether there is a GPU. So its own code for many lanes runs, with its reset masks,
+padded joints and arm control, and what it forgets to apply, to update or to fetch is stale here, too. What stays for test_cuda.py: what
+PhysX itself does otherwise on a GPU, tensors on the wrong device, and lanes that meet (here each has a world of its own).
 """
 from contextlib import contextmanager
 from types import SimpleNamespace
@@ -25,7 +26,7 @@ class Buffer:
     """As SAPIEN's arrays on a GPU."""
 
     def __init__(self, *shape):
-        self._values = torch.zeros(shape)
+        self._values = torch.full(shape, torch.nan)  # nobody says what a GPU's hold at first
 
     def torch(self):
         return self._values
@@ -58,8 +59,11 @@ class EmulatedSystem:
         most = max((articulation.dof for articulation in self.articulations), default=0)
         for name in ("qpos", "qvel", "qacc", "qf", "target_qpos", "target_qvel"):
             setattr(self, f"cuda_articulation_{name}", Buffer(len(self.articulations), most))
-        self._fetch_bodies(self.bodies)
+        for name in ("target_qpos", "target_qvel"):
+            self._joints(name).zero_()
         self._lay_floors()
+        self.step()  # as a GPU's does
+        self._fetch_bodies(self.bodies)
 
     def _lay_floors(self):
         """ManiSkill gives the first lane alone a floor, because on a GPU all lanes stand on it."""
@@ -78,6 +82,7 @@ class EmulatedSystem:
     def step(self):
         for world in self.worlds:
             world.step()
+        self._poses = {link: link.entity_pose for link in self.links}
 
     def gpu_create_contact_pair_impulse_query(self, pairs):
         return SimpleNamespace(pairs=pairs, cuda_impulses=Buffer(len(pairs), 3))
@@ -125,7 +130,8 @@ class EmulatedSystem:
         self._apply_targets("target_qvel", "set_drive_velocity_target")
 
     def gpu_update_articulation_kinematics(self):
-        """On a CPU links follow at once."""
+        """On a CPU links follow their joints at once; what is fetched follows only then."""
+        self._poses = {link: link.entity_pose for link in self.links}
 
     def _apply(self, name):
         for number, articulation in enumerate(self.articulations):
@@ -167,7 +173,7 @@ class EmulatedSystem:
 
     def _fetch_bodies(self, bodies, columns=slice(0, 13)):
         for body in bodies:
-            pose = body.entity_pose
+            pose = self._poses.get(body, None) or body.entity_pose
             values = np.concatenate([pose.p, pose.q, body.linear_velocity, body.angular_velocity])
             self.cuda_rigid_body_data.torch()[self.row[body], columns] = torch.from_numpy(values[columns])
 

@@ -30,6 +30,7 @@ from pdkit.tasks.chair_body import chair_start
 from pdkit.tasks.faucet_env import faucet_start
 from pdkit.tasks.horizon import horizon_spec
 from pdkit.tasks.lanes import IDLE
+from pdkit.tasks.maniskill import with_base_pose
 from pdkit.tasks.peg import peg_start
 from pdkit.tasks.vector import SIMULATORS, VectorEnv
 
@@ -368,6 +369,25 @@ def test_success_of_one_lane_is_that_lanes(several):
     assert env.evaluate()["success"].tolist() == [True, False, False, False]
 
 
+def test_nothing_touches_the_robot_when_a_scene_is_set_up(several):
+    """A GPU simulates a step then, with bodies where they were built."""
+    lanes, _ = several("PushChair")
+    lanes._env.reset(seed=SEEDS.tolist(), options={"reconfigure": True})
+    for world in lanes._env.scene.px.worlds:
+        world.step()
+        pairs = [sorted(body.name.split("_")[0].split("-")[2] for body in contact.bodies if "_" in body.name)
+                 for contact in world.get_contacts() if any(point.separation < 0 for point in contact.points)]
+        assert ["chair", "pdkit"] not in pairs
+        assert all(abs(joint) < 50 for one in world.articulation_link_components for joint in one.articulation.qvel)
+
+
+def test_a_plain_reset_starts_faucets_where_the_fast_step_does(several):
+    lanes, fast = several("TurnFaucet")
+    observations, _ = lanes._env.reset(seed=SEEDS.tolist(), options={"reconfigure": True})
+    expected = [sim.reset(int(seed)) for sim, seed in zip(fast, SEEDS, strict=True)]
+    np.testing.assert_allclose(with_base_pose(lanes._env, observations), expected, atol=1e-6)
+
+
 def fetched(env):
     """What was set, simulated and seen."""
     env.scene._gpu_apply_all()
@@ -384,6 +404,10 @@ def test_lanes_have_the_friction_and_damping_of_the_episode_that_they_were_built
         swivel = ["helper" in joint.parent_link.name for joint in joints]
         np.testing.assert_allclose(values[swivel], [start.swivel], rtol=1e-5)
         np.testing.assert_allclose(values[:2], start.frictions[:2], rtol=1e-5)
+        for name, link in built.links_map.items():  # wheels grip, and a seat does not collide with its foot, in every lane
+            for shape in link._objs[0].collision_shapes:
+                assert shape.physical_material.dynamic_friction == pytest.approx(1.0 if name.startswith("wheel") else 0.1)
+                assert bool(shape.collision_groups[2] & 1 << 31) == (name in ("seat", "support"))
     lanes, _ = several("TurnFaucet")
     lanes.reset(np.arange(4), SEEDS)
     assert lanes._env.target_switch_link.joint.friction.numpy() == pytest.approx(0.1)

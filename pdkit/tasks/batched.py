@@ -2,12 +2,13 @@
 
 Here it is stock ManiSkill that steps, not the fast step of maniskill.py. What differs for a user:
 
-- The arm is controlled otherwise. On a CPU inverse kinematics is solved until the gripper's target is reached; on a GPU ManiSkill
+- A Panda's arm is controlled otherwise. On a CPU inverse kinematics is solved until the gripper's target is reached; on a GPU ManiSkill
   takes one step along the Jacobian, which falls the shorter the further an action goes.
 - Physics on a GPU does not repeat bit for bit, so neither does a training run, and a restored checkpoint puts lanes only nearly
   where they were.
 - Only training is simulated so. Every evaluation is made by the fast step on the CPU, in the world in which all policies of this
-  kit are compared. StackCube's, TurnFaucet's and PushChair's shipped decorated policies solve about as much either way (slow tests).
+  kit are compared. With a GPU's arm control StackCube's, TurnFaucet's and PushChair's shipped decorated policies solve about as much
+  on a CPU, the last two over an emulated GPU (slow tests); on a real one that is not known.
 - An episode starts where the fast step starts it for the same seed, but bodies cannot be built while the GPU simulates: a lane keeps
   the peg and the box, the faucet and the handle that is to be turned, or the chair and its joints' friction, of its first episode, and
   only where they are changes.

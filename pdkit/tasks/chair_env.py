@@ -96,7 +96,7 @@ class PushChairEnv(BaseEnv):
     @property
     def _default_sim_config(self) -> SimConfig:
         return SimConfig(
-            sim_freq=100, control_freq=HZ, spacing=20,  # metres between lanes on a GPU: at most 10 seconds at 0.7 m/s, from 2.4 m
+            sim_freq=100, control_freq=HZ, spacing=24,  # metres between lanes on a GPU, which could meet: in 10 s a base gets 9.5 m far
             scene_config=SceneConfig(solver_position_iterations=15),
             default_materials_config=DefaultMaterialsConfig(static_friction=0.5, dynamic_friction=0.5, restitution=0))
 
@@ -131,7 +131,8 @@ class PushChairEnv(BaseEnv):
         loader.set_density(200)
         with chair.model.file() as path:
             builder = loader.parse(path)["articulation_builders"][0]
-        builder.initial_pose = sapien.Pose(chair.position, chair.rotation)
+        # A GPU simulates a step when its scene is set up, and the robot stands at the origin then.
+        builder.initial_pose = sapien.Pose(np.add(chair.position, (2.0 * self.gpu_sim_enabled, 0, 0)), chair.rotation)
         builder.set_scene_idxs([lane])
         built = builder.build(fix_root_link=False)
         self.remove_from_state_dict_registry(built)

@@ -121,7 +121,7 @@ class FaucetEnv(TurnFaucetEnv):
 
     def first_angles(self) -> torch.Tensor:
         """The faucets' joint positions (N, most joints of one) when an episode starts, radians."""
-        joints = self.faucet.get_qpos() * 0
+        joints = torch.zeros((self.num_envs, self.faucet.max_dof), device=self.device)
         joints[torch.arange(self.num_envs, device=self.device), self.target_switch_link.joint.active_index] = self.init_angle
         return joints
 
