@@ -17,6 +17,7 @@ import pdkit.recorded as recorded
 from pdkit import cli, imitate, report, train, train_base, train_decorated
 from pdkit.decorated import load_decorated
 from pdkit.demos import load_demos, save_demos
+from pdkit.demos.cli import main as demos_cli
 from pdkit.errors import PdkitError
 from pdkit.files import DATA, locked, read_json, write_json
 from pdkit.imitate import Saved
@@ -130,6 +131,12 @@ def test_human_demonstrations_are_clipped_and_judged(monkeypatch, tmp_path):
     demos = sources.human("Door")
     assert demos.label == "human" and demos.actions.max() == 1.0
     assert demos.success.tolist() == [False, False, True, True]
+    monkeypatch.setattr(Dataset, "iterate_episodes", lambda self: [Recorded] * 3)
+    for given, kept in (((), 3), (("--num", "2"), 2)):
+        assert demos_cli(["Door", "--source", "human", *given, "--out", str(tmp_path / "human.safetensors")]) == 0
+        assert load_demos(tmp_path / "human.safetensors").num == kept
+    with pytest.raises(PdkitError, match="leave them out with --source human"):
+        demos_cli(["Door", "--source", "human", "--noise", "0.1"])
     Recorded.rewards = np.full(4, 20.0)
     with pytest.raises(PdkitError, match="do not say at which steps they were solved"):
         sources.human("Hammer")

@@ -24,7 +24,7 @@ SOURCES = ("scripted", "agent", "human", "hub")
 def main(argv: list[str]) -> int:
     parser = Parser(prog="pdkit demos", description="Make demonstrations of a task, or describe a file of them.")
     parser.add_argument("task", nargs="?", help=f"one of: {', '.join(TASKS)}")
-    parser.add_argument("--num", type=int, default=100, help="episodes to make, or at most to take from the hub (default 100)")
+    parser.add_argument("--num", type=int, help="episodes to make, or at most to take from the hub (default 100) or of 25 by humans")
     parser.add_argument("--source", choices=SOURCES, help="who acts (default: a scripted expert where there is one, else an agent); "
                                                              "human and hub (ManiSkill's motion planning) are fetched from the network")
     parser.add_argument("--first-seed", type=int, help="seed of the first episode (scripted: 0, agent: 3000000)")
@@ -47,13 +47,16 @@ def main(argv: list[str]) -> int:
         return 0
     if not args.task:
         raise PdkitError("Name a task, for example `pdkit demos StackCube --num 1000`, or use --list.")
+    source = args.source or ("scripted" if args.task in EXPERTS else "agent")
+    args.num = (25 if source == "human" else 100) if args.num is None else args.num
     if args.num < 1:
         raise PdkitError(f"--num must be at least 1, not {args.num}.")
     for name, value, most in (("--first-seed", args.first_seed, LAST_SEED), ("--noise", args.noise, 10.0), ("--tail", args.tail, 10_000)):
         if value is not None and not 0 <= value <= most:
             raise PdkitError(f"{name} must be from 0 to {most:,}, not {value}.")
+    if source in ("human", "hub") and (args.noise or args.first_seed is not None):
+        raise PdkitError(f"--noise and --first-seed are of demonstrations that are made here; leave them out with --source {source}.")
     get_task(args.task)
-    source = args.source or ("scripted" if args.task in EXPERTS else "agent")
     tries = max(4 * args.num, args.num + 50)  # with those that fail
     if source in ("scripted", "agent") and args.first_seed is not None and TEST - tries < args.first_seed < ROLLOUT:
         raise PdkitError(f"Seeds from {TEST:,} to {ROLLOUT - 1:,} are of the episodes by which policies are tested and chosen: take a "
@@ -84,7 +87,8 @@ def _draw(args) -> int:
 
 def _make(args, source: str) -> Demos:
     if source == "human":
-        return sources.human(args.task)
+        demos = sources.human(args.task)
+        return demos.first(min(args.num, demos.num))
     if source == "hub":
         from .hub import from_hub
 

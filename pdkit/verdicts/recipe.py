@@ -166,6 +166,7 @@ def _() -> Finding:
         raise TooLittle("Fewer than two kinds of base policy are recorded with three seeds.")
     least = min(gains, key=lambda kind: gains[kind][0].value)
     told = ", ".join(f"{kind} {signed(gain.value)}{task_by_task(values, signed)}" for kind, (gain, values) in gains.items())
+    told += "; beside them Diffusion Policies of the other tasks (diffusion_tasks, diffusion_door) and the MLPs of the main job"
     return finding("base_policies", pd.concat([values for _, values in gains.values()]), f"points gained: {told}",
                    f"{least}: {points(gains[least][0])}", jointly(*(judged_over_tasks(values) for _, values in gains.values())))
 
