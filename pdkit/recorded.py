@@ -23,7 +23,8 @@ from .tasks.partnet import object_set
 KEYS = ["task", "recipe", "seed"]  # a row with the same ones is replaced
 # Of a run's metrics.csv, what its recorded curve leaves out, so that the repository stays small: the clock of another machine, and what no
 # figure or verdict reads.
-UNRECORDED = ["seconds", "eval_seconds", "actor_loss", "residual_abs", "target_mean", "train_length", "train_episodes"]
+UNRECORDED = ["seconds", "eval_seconds", "residual_abs", "target_mean", "train_length", "train_episodes", "actor_loss", "policy_loss",
+              "value_loss", "kl", "clipped", "ot_error", "bc_share"]
 TRAINING = "pdkit train decorated"  # how a command that makes a row of a training begins
 SETTINGS = "settings"  # the column that tells rows of other settings apart: a `mark`, whose settings the manifest holds
 UNTIED = {*NO_MATTER, "threads", "pictures", "strict"}  # what a row's settings do not tell, as its numbers do not depend on it
