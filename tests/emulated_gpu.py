@@ -82,7 +82,7 @@ class EmulatedSystem:
     def step(self):
         for world in self.worlds:
             world.step()
-        self._poses = {link: link.entity_pose for link in self.links}
+        self.gpu_update_articulation_kinematics()
 
     def gpu_create_contact_pair_impulse_query(self, pairs):
         return SimpleNamespace(pairs=pairs, cuda_impulses=Buffer(len(pairs), 3))
@@ -173,7 +173,7 @@ class EmulatedSystem:
 
     def _fetch_bodies(self, bodies, columns=slice(0, 13)):
         for body in bodies:
-            pose = self._poses.get(body, None) or body.entity_pose
+            pose = self._poses.get(body) or body.entity_pose
             values = np.concatenate([pose.p, pose.q, body.linear_velocity, body.angular_velocity])
             self.cuda_rigid_body_data.torch()[self.row[body], columns] = torch.from_numpy(values[columns])
 

@@ -73,7 +73,7 @@ def _faucet(env: Any, lane: int, seed: int, built: int) -> Start:
 
     start = faucet_start(seed, env.models)
     pose = start.pose(env.models[env.starts[lane].model])
-    return Start(start.joints, articulated={"faucet": (np.concatenate([pose.p, pose.q]), env.first_angles()[lane].cpu().numpy())})
+    return Start(start.joints, articulated={"faucet": (np.concatenate([pose.p, pose.q]), env.first_angles[lane].cpu().numpy())})
 
 
 def _chair(env: Any, lane: int, seed: int, built: int) -> Start:

@@ -103,6 +103,8 @@ class FaucetEnv(TurnFaucetEnv):
         self.init_angle = torch.where(low.isinf(), 0.0, low)
         self.target_angle = torch.where(high.isinf(), torch.pi / 2, low + (high - low) * 0.9)
         self.target_angle_diff = self.target_angle - self.init_angle
+        self.first_angles = torch.zeros((self.num_envs, self.faucet.max_dof), device=self.device)  # of all joints when an episode starts
+        self.first_angles[torch.arange(self.num_envs, device=self.device), self.target_switch_link.joint.active_index] = self.init_angle
         self.target_link_pos, self.target_joint_axis = torch.zeros((2, self.num_envs, 3), device=self.device)
 
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
@@ -112,18 +114,12 @@ class FaucetEnv(TurnFaucetEnv):
         self.agent.robot.set_pose(sapien.Pose(BASE))
         poses = [start.pose(self.models[start.model]) for start in self.starts]
         self.faucet.set_pose(Pose.create(torch.tensor(np.stack([[*poses[lane].p, *poses[lane].q] for lane in lanes]), device=self.device)))
-        self.faucet.set_qpos(self.first_angles()[env_idx])
+        self.faucet.set_qpos(self.first_angles[env_idx])
         if self.gpu_sim_enabled:  # links follow their joints only then
             self.scene._gpu_apply_all()
             self.scene.px.gpu_update_articulation_kinematics()
             self.scene._gpu_fetch_all()
         self._look(env_idx)
-
-    def first_angles(self) -> torch.Tensor:
-        """The faucets' joint positions (N, most joints of one) when an episode starts, radians."""
-        joints = torch.zeros((self.num_envs, self.faucet.max_dof), device=self.device)
-        joints[torch.arange(self.num_envs, device=self.device), self.target_switch_link.joint.active_index] = self.init_angle
-        return joints
 
     def set_state_dict(self, state: dict, env_idx: torch.Tensor | None = None) -> None:
         """As an episode's start: the observation goes on to show where the handles are now."""
